@@ -81,11 +81,6 @@ class CrossValidation:
         """Standard error of the elpd by the number of draws of the posterior."""
         return float(np.linalg.norm(self.errors))
 
-    @property
-    def group_sizes(self) -> NDArray[np.int64]:
-        """Measurements times channels of each group, (G,)."""
-        return np.array([self.log_density[rows].size for rows in self.rows])
-
 
 @programs_kept()
 def cross_validate(
@@ -286,7 +281,7 @@ def rank_models(
         gaps = best.elpd_by_group - one.elpd_by_group
         elpd_diff, dse = float(gaps.sum()), float(np.sqrt(gaps.size) * gaps.std(ddof=1))
         dse = math.hypot(dse, 0.0 if one is best else math.hypot(one.error, best.error))
-        least_diff = float(np.min(gaps / best.group_sizes))
+        least_diff = float(np.min(gaps / [best.log_density[rows].size for rows in best.rows]))
         decisive = least_diff > options.decisive_per_measurement
         scores[name] = ModelScore(
             elpd=one.elpd,

@@ -65,11 +65,6 @@ class Instrument:
         if self.rings is not None:
             require_count("Instrument.rings", self.rings, 1, MOST_RINGS)
 
-    @property
-    def has_cones(self) -> bool:
-        """Whether there is anything to take the mean over."""
-        return self.source_aperture > 0.0 or self.detector_aperture > 0.0
-
 
 class Setting(NamedTuple):
     """The numbers of an instrument that may be free: tilt in degrees, gains (K,); None where there are none."""
@@ -140,8 +135,8 @@ def optics_of(
         wi, wo = (np.asarray(_tilted(w, _forward(wi), tilt), float) for w in (wi, wo))
     most = float(np.max(np.abs(tilt.arrays()[1:]))) if isinstance(tilt, Free) else 0.0
     pairs, row, share = (wi, wo), None, None
-    if instrument.has_cones:
-        widths = instrument.source_aperture, instrument.detector_aperture
+    widths = instrument.source_aperture, instrument.detector_aperture
+    if any(widths):
         spread = spread_over_lobes(*widths, stack, wi, wo, most, instrument.rings)
         if spread.matters.any():
             pairs, row, share = _cones(instrument, wi, wo, spread, other)
@@ -218,15 +213,10 @@ def _over_disc(w: Floats, radius: float, disc: Floats) -> Floats:
     cosine = 1.0 - (1.0 - math.cos(radius)) * square
     sine = np.sqrt((1.0 - cosine) * (1.0 + cosine))
     across = disc * (sine / np.where(square > 0.0, np.sqrt(square), 1.0))[:, None]
-    first, second = _across(w)
-    return cosine[:, None, None] * w + across[:, :1, None] * first + across[:, 1:, None] * second
-
-
-def _across(w: Floats) -> tuple[Floats, Floats]:
-    """Unit vectors across w (M, 3): in its plane with the normal, and along the horizon; both turn with the azimuth."""
+    # unit vectors across w, along the horizon and in its plane with the normal: both turn with the azimuth
     forward = _horizontal(w)
     along = np.stack([-forward[:, 1], forward[:, 0], np.zeros(len(w))], axis=-1)
-    return np.cross(along, w), along
+    return cosine[:, None, None] * w + across[:, :1, None] * np.cross(along, w) + across[:, 1:, None] * along
 
 
 def _horizontal(w: Floats) -> Floats:

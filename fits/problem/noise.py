@@ -153,7 +153,8 @@ class Levels(NamedTuple):
     @property
     def smallest(self) -> Floats:
         """What sigma cannot fall below, (N, C) or (1,), in 1/sr."""
-        return np.sqrt(self.variance + _lowest(self.floor) ** 2)
+        floor = self.floor.low if isinstance(self.floor, Free) else self.floor
+        return np.sqrt(self.variance + np.square(floor))
 
     @property
     def fitted(self) -> bool:
@@ -167,7 +168,8 @@ class Levels(NamedTuple):
 
     def softness(self, values: Floats) -> Floats:
         """The softness of the logarithms of measurements (N, C), see `fits.problem.discrepancy`."""
-        return softness(values, np.sqrt(self.variance + _start(self.floor) ** 2))
+        floor = self.floor.start if isinstance(self.floor, Free) else self.floor
+        return softness(values, np.sqrt(self.variance + np.square(floor)))
 
     def gram(self, process: Process, values: Floats) -> Array | None:
         """What measurements (N, C) tell of a process of the discrepancy; None where it depends on parameters."""
@@ -193,11 +195,3 @@ def noise_levels(noise: Noise, used: Measurements) -> Levels:
         alone = not is_free(relative) and relative == 0
         floor = 0.0 if alone else DEFAULT_FLOOR * float(np.median(np.abs(used.values)))
     return Levels(np.zeros(1) if sigma is None else np.square(sigma), relative, floor)
-
-
-def _lowest(level: float | Free) -> float:
-    return float(level.arrays()[1]) if isinstance(level, Free) else float(level)
-
-
-def _start(level: float | Free) -> float:
-    return float(level.arrays()[0]) if isinstance(level, Free) else float(level)

@@ -136,12 +136,6 @@ def _log_normaliser(prior: Prior, low: float, high: float) -> float:
     return log_mass - math.log(inverse_sd) + 0.5 * math.log(2 * math.pi)
 
 
-def _steps(random_walk_sd: Any, channels: int) -> Floats:
-    """Differences between neighbouring channels over their standard deviations, (channels - 1, channels)."""
-    inverse = 1.0 / np.broadcast_to(np.asarray(random_walk_sd, float), (channels - 1,))
-    return inverse[:, None] * np.diff(np.eye(channels), axis=0)
-
-
 def _random_walk_normaliser(prior: Prior, steps: Floats, normalisers: Floats) -> Floats:
     """Of channels (C,), by the normaliser of each and the steps between them: of all together, in the first.
 
@@ -377,8 +371,7 @@ class Box(eqx.Module):
         for entry in free:
             here = slice(first, first := first + math.prod(entry.shape))
             if entry.random_walk_sd is not None:
-                rows = np.zeros((here.stop - here.start - 1, len(low)))
-                rows[:, here] = _steps(entry.random_walk_sd, here.stop - here.start)
+                rows = np.diff(np.eye(len(low))[here], axis=0) / np.reshape(entry.random_walk_sd, (-1, 1))
                 differences.append(rows)
                 logs[here] = _random_walk_normaliser(entry.prior, rows[:, here], logs[here])
         return cls(

@@ -328,13 +328,10 @@ def _value(where: str, value: Any, hint: Any, name: str) -> Any:
         return numbers(where, value) if float in kinds else whole_numbers(where, value, len(kinds))
     if name.endswith(".phase"):
         return _build(where, value, _PHASES)
-    return _number_or_free(where, value, lj.RANGES.get(name, ANY))
-
-
-def _number_or_free(where: str, value: Any, allowed: Range) -> float | tuple[float, ...] | Free | PowerLaw:
     if isinstance(value, dict) and "kind" in value:
-        return cast(PowerLaw, _build(where, value, _LAWS))
-    return _free(where, value, allowed) if isinstance(value, dict) else numbers(where, value, allowed)
+        return _build(where, value, _LAWS)
+    read = _free if isinstance(value, dict) else numbers
+    return read(where, value, lj.RANGES.get(name, ANY))
 
 
 def _free(where: str, table: Any, allowed: Range = ANY) -> Free:

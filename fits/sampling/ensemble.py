@@ -52,7 +52,7 @@ class Ensemble:
             sampler = emcee.EnsembleSampler(
                 *self.chain.shape, self.log_posteriors, moves=moves, vectorize=True, backend=self.chain
             )
-            count = min(step, next_fit(begin)) - begin
+            count = min(step, int(FITS[begin < FITS].min())) - begin  # until proposals are fitted again
             # walkers are drawn from a density of full rank: emcee need not look whether they are
             for _ in sampler.sample(state, iterations=count, skip_initial_state_check=True):
                 show()
@@ -86,8 +86,3 @@ def proposals_of(chain: Chain) -> Density:
     positions = chain.chain[last // 2 : last].reshape(-1, chain.shape[-1])
     with one_thread():  # the same to the last bit, whatever else runs
         return FittedProposal.to(positions.copy(), np.random.RandomState(last), initial)
-
-
-def next_fit(step: int) -> int:
-    """The first step after this one that proposals are fitted at again."""
-    return int(FITS[step < FITS].min())
