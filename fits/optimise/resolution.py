@@ -23,7 +23,7 @@ from fits.optimise.multi_start import Optimum, Solver, StartOutcome, bounded_des
 from fits.optimise.options import FitOptions
 from fits.problem.apertures import most_rings
 from fits.problem.instrument import rings_for
-from fits.problem.model import Density, Model
+from fits.problem.model import Model
 from fits.problem.problem import FittingProblem, Problem
 from fits.progress import Progress
 from layerjax.mixture import stacks_of
@@ -386,7 +386,7 @@ def _fitted_again(
     solve = rough_descent if solver == "least_squares" else bounded_descent
 
     def cost(end: StartOutcome) -> float:
-        found = float(problem.call(Density.cost_at, end.vector, problem.predict(end.vector)))
+        found = float(problem.call(Model.cost_at, end.vector, problem.predict(end.vector)))
         return found if np.isfinite(found) else np.inf
 
     # 1. ends that lie close together count as one, lowest first

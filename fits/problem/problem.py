@@ -29,7 +29,7 @@ from fits.problem.compilation import Static, run
 from fits.problem.discrepancy import Discrepancy, Process, make_process, numbers_of
 from fits.problem.hemispherical import Totalling
 from fits.problem.instrument import Instrument, optics_of, setting_of
-from fits.problem.model import Density, JointModel, Model, Transport
+from fits.problem.model import JointModel, Model, Transport
 from fits.problem.noise import Levels, Noise, is_assumed, noise_levels
 from fits.problem.parameters import Box, Free, LogNormal, Normal, is_free, names_of, require_in_range, split
 from layerjax._checks import in_short, require_choice, require_kind, require_number
@@ -143,32 +143,32 @@ class FittingProblem(abc.ABC):
 
     def predict(self, vector: ArrayLike) -> Array:
         """Scaled BSDF of the used samples, (N, C), in 1/sr; of several data sets one after the other, (N, 1)."""
-        return self.call(Density.predict, vector)
+        return self.call(Model.predict, vector)
 
     def residuals(self, vector: ArrayLike) -> Array:
         """All residuals of the least-squares problem, (rows,): half their sum of squares is what a fit minimises."""
-        return jnp.concatenate([part.reshape(-1) for part in self.call(Density.residuals, vector)])
+        return jnp.concatenate([part.reshape(-1) for part in self.call(Model.residuals, vector)])
 
     def log_likelihood(self, vector: ArrayLike) -> Array:
         """Normalised log-likelihood of the used samples with the physical vector (P,)."""
-        return self.call(Density.log_likelihood, vector)
+        return self.call(Model.log_likelihood, vector)
 
     def log_likelihood_per_datum(self, vector: ArrayLike) -> Array:
         """Normalised log-density of each datum with the physical vector (P,), (N, C)."""
-        return self.call(Density.log_likelihood_per_datum, vector)
+        return self.call(Model.log_likelihood_per_datum, vector)
 
     def log_prior(self, vector: ArrayLike) -> Array:
         """Log-density of the physical vector, -inf outside the bounds."""
-        return self.call(Density.log_prior, vector)
+        return self.call(Model.log_prior, vector)
 
     def log_posterior_unconstrained(self, u: ArrayLike) -> Array:
         """Log-posterior over the unconstrained vector (P,), -inf where undefined."""
-        return self.call(Density.log_posterior_unconstrained, u)
+        return self.call(Model.log_posterior_unconstrained, u)
 
     def call(self, function: Callable[..., Any], *arguments: Any) -> Any:
-        """`function(model, *arguments)`, compiled once for all of this structure; of a method of `Density` the model's
+        """`function(model, *arguments)`, compiled once for all of this structure; of a method of `Model` the model's
         own of that name."""
-        if function in vars(Density).values():
+        if function in vars(Model).values():
             function = getattr(type(self.model), function.__name__)
 
         def is_vector(argument: Any) -> bool:  # numbers that are listed make an array; a named tuple holds arrays
