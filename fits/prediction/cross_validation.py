@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import minimize
 from scipy.special import log_softmax, logsumexp, softmax
 
+from fits.data.geometry import Floats
 from fits.data.measurements import Measurements
 from fits.data.scans import incidences, scans
 from fits.optimise.fit import refit
@@ -44,7 +45,6 @@ INFINITE_NOISE = 1e8
 LARGEST_LOG_RATIO = 30.0
 """Bound of the logarithms of ratios of stacking weights."""
 
-Floats = NDArray[np.float64]
 
 Checkpoint = Callable[[str, Callable[[], Any]], Any]
 """Gives the record of this name: what the call computes, or what an earlier run has kept of it."""

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from scipy import stats
 from scipy.special import logsumexp
 
-from fits.data.geometry import Geometry
+from fits.data.geometry import Floats, Geometry
 from fits.data.measurements import TO_HAVE_THEM, Measurements, Source
 from fits.data.totals import Totals
 from fits.optimise.result import Fit
@@ -59,8 +59,6 @@ BISECTIONS = 50
 
 SMALLEST_SD = 1e-12
 """The least standard deviation of the discrepancy, where the data determine it: its distribution keeps a density."""
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

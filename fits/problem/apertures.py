@@ -19,11 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 import layerjax as lj
-from fits.data.geometry import TANGENT_COSINE
+from fits.data.geometry import TANGENT_COSINE, Floats
 from fits.problem.parameters import is_free
 from layerjax.mixture import stacks_of
 
-Floats = NDArray[np.float64]
 Counts = tuple[int, int, int]
 
 MOST_RINGS = 8

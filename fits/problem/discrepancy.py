@@ -33,9 +33,9 @@ from jax import Array
 from jax.scipy.linalg import solve_triangular
 from numpy.typing import ArrayLike, NDArray
 
+from fits.data.geometry import Floats
 from fits.problem.parameters import Free, LogNormal, Normal, require_number_or_free
 
-Floats = NDArray[np.float64]
 Trio = tuple[Array, Array, Array]
 
 LONGEST = 40.0

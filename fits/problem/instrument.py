@@ -14,14 +14,12 @@ import numpy as np
 from jax import Array
 from numpy.typing import NDArray
 
-from fits.data.geometry import AT_NORMAL, LIGHT_AZIMUTH, polar
+from fits.data.geometry import AT_NORMAL, LIGHT_AZIMUTH, Floats, polar
 from fits.data.scans import SAME_ANGLE
 from fits.problem.apertures import MOST_RINGS, Spread, ray_counts, rays, spread_over_lobes
 from fits.problem.parameters import Free, LogNormal, require_number_or_free
 from layerjax._checks import require_count, require_number
 from layerjax.transport.known_directions import KnownDirections, known_directions
-
-Floats = NDArray[np.float64]
 
 WIDEST, MOST_TILT, GAIN_SPREADS = 30.0, 10.0, (1e-4, 1.0)
 """Degrees of a cone, degrees that a sample may be tilted, and relative standard deviations of gains."""

@@ -18,8 +18,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jax.scipy.special import gammaln
-from numpy.typing import NDArray
 
+from fits.data.geometry import Floats
 from fits.data.measurements import Measurements
 from fits.names import Objective
 from fits.problem.discrepancy import Discrepancy, Process, size, softness
@@ -138,9 +138,6 @@ def _log1p_ratio(x: Array) -> Array:
     series = 1.0 - inner * (1 / 2 - inner * (1 / 3 - inner / 4))
     tame = jnp.where(small, 1.0, x)
     return jnp.where(small, series, jnp.log1p(tame) / tame)
-
-
-Floats = NDArray[np.float64]
 
 
 class Levels(NamedTuple):

@@ -19,15 +19,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from numpy.typing import NDArray
 from scipy import stats
 
 import layerjax as lj
+from fits.data.geometry import Floats
 from layerjax._checks import in_short, require_choice, require_kind, require_number
 from layerjax._shown import Shown
 from layerjax.mixture import stacks_by_name
-
-Floats = NDArray[np.float64]
 
 FARTHEST_MEAN = 37.0  # standard deviations from the bounds; farther out the density within them underflows in float64
 NARROWEST = 1e-15  # standard deviation, as a share of the distances in the box: below, float64 has no numbers for it

@@ -18,9 +18,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 import layerjax as lj
+from fits.data.geometry import Floats
 from fits.data.measurements import TO_HAVE_THEM, Measurements
 from fits.data.scans import groups
 from fits.data.totals import Totals
@@ -38,8 +39,6 @@ from layerjax._shapes import channel_count
 from layerjax.mixture import require_material
 from layerjax.stack import with_known
 from layerjax.transport.known_directions import known_directions
-
-Floats = NDArray[np.float64]
 
 UNITS = {
     "noise.floor": "1/sr",

@@ -9,8 +9,8 @@ from functools import partial
 
 import emcee
 import numpy as np
-from numpy.typing import NDArray
 
+from fits.data.geometry import Floats
 from fits.optimise.result import Fit
 from fits.problem.compilation import cores, in_shares, one_thread
 from fits.sampling.chain import Chain
@@ -25,8 +25,6 @@ FITS = (25 * 1.5 ** np.arange(40.0)).astype(int)
 DIFFERENCE = 1.2
 """Length of differential evolution, where 2.38 is best for a normal posterior: curved ones are narrower than they are
 long."""
-
-Floats = NDArray[np.float64]
 
 
 class Ensemble:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import expit, logit
 
+from fits.data.geometry import Floats
 from fits.optimise.uncertainty import local_information, square
 from fits.problem.problem import Problem
 
@@ -21,8 +22,6 @@ NEXT_TO_BOUND = 0.02  # of the box
 ROUNDS = 5
 ON_RIDGE = 0.1  # standard deviations
 TINY = 1e-300
-
-Floats = NDArray[np.float64]
 
 
 class Ridge(NamedTuple):
