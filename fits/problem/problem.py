@@ -281,9 +281,9 @@ class Joint(FittingProblem):
 
     Args:
         parts: the problems by name, two or more, each with a likelihood.
-        shared: names of parameters that are one in all problems: ``layers[0].ior``, or how names begin, such as
-            ``layers[0]`` for all that is free in that layer. Bounds and priors must agree; they start as in the first.
-            The others are named after their problem, ``plane.scale``.
+        shared: names of parameters that are one in all problems: ``layers[0].ior``, with all its channels, or how names
+            begin, such as ``layers[0]`` for all that is free in that layer. Bounds and priors must agree; they start as
+            in the first. The others are named after their problem, ``plane.scale``.
 
     Raises:
         ValueError: fewer than two problems, a named objective, a shared name that is not in every problem, or free

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 import layerjax as lj
-from fits.cli.parser import main
 from fits.problem.discrepancy import Discrepancy
 from fits.problem.instrument import Instrument
 from fits.problem.noise import Noise
@@ -347,15 +346,3 @@ def test_priors_that_cannot_be_computed_with_are_refused(tmp_path: Path, prior: 
     assert message is not None
     assert message.startswith("base.albedo")
     assert words in message
-
-
-@pytest.mark.parametrize("name", ["309 digits", "arrays 20000 deep"])
-def test_the_command_line_says_so_on_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str) -> None:
-    path = tmp_path / "stack.toml"
-    path.write_text(PLACES["layers[0].thickness"].replace("@", VALUES[name]))
-    assert main(["simulate", "--stack", str(path), "--out", str(tmp_path / "new.csv")]) == 2
-    output = capsys.readouterr()
-    assert (output.out, output.err.count("\n")) == ("", 1)
-    assert output.err.startswith(f"layerjax: error: {path}: ")
-    assert len(output.err) < 300 + len(str(path))
-    assert not (tmp_path / "new.csv").exists()

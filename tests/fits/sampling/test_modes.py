@@ -9,7 +9,6 @@ import pytest
 from scipy import special, stats
 
 import fits
-import layerjax as lj
 from fits.optimise.fit import fit
 from fits.optimise.result import Fit
 from fits.prediction.importance import importance_draws
@@ -149,29 +148,3 @@ def test_it_is_said_where_shares_of_modes_are_not_known(fitted: Fit) -> None:
     assert any("R-hat of at most 1.01 are needed" in line for line in lines)
     with pytest.raises(ValueError, match=r"with R-hat of at most 1.01 \(it is [1-9]"):
         posterior.summary()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("sampler", ["emcee", "nuts"])
-def test_two_metals_that_share_a_surface(sampler: Sampler) -> None:
-    """Whichever is called which: both have one mean, half of their sum, and a deviation of half their difference."""
-    if sampler == "nuts":
-        pytest.importorskip("blackjax")
-
-    def metal(alpha) -> lj.Stack:
-        return lj.Stack([], lj.Conductor(0.2, 3.0, alpha))
-
-    single, geometry = lj.SingleScattering(), fits.slices([20.0, 50.0], np.arange(-70.0, 71.0, 5.0))
-    data = fits.simulate(
-        lj.Mixture({"a": metal(0.12), "b": metal(0.4)}, [0.5, 0.5]), geometry, single, 0.03, 1e-4, seed=1
-    )
-    stack = lj.Mixture({name: metal(Free(start, 0.02, 1.0)) for name, start in (("a", 0.2), ("b", 0.3))}, [0.5, 0.5])
-    found = fits.fit(stack, data, transport=single, noise=fits.Noise(0.03, 1e-4, discrepancy=False), starts=8)
-    posterior = sample(found, sampler=sampler, seed=1)
-    assert posterior.converged
-    first, second = found.vector
-    error = 4.0 / math.sqrt(posterior.effective_samples.min())
-    for *_, mean, deviation in posterior.summary().values():
-        assert mean == pytest.approx(0.5 * (first + second), abs=error * 0.14)
-        assert deviation == pytest.approx(0.5 * abs(first - second), rel=error)
-    assert [mode.share for mode in posterior.modes] == [pytest.approx(0.5, abs=error)] * 2
