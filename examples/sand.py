@@ -21,7 +21,7 @@ ALBEDO, ROUGHNESS = (0.518, 0.331, 0.184), 0.5
 SEED = 3
 COLOURS, WIDTH = fits.Free([0.4, 0.4, 0.4], 0.0, 1.0), fits.Free(0.4, 0.0, 1.0)
 SURFACES = {
-    "VMF diffuse, transport": lj.VMFDiffuse(COLOURS, WIDTH, form="all_orders"),
+    "VMF diffuse, all orders": lj.VMFDiffuse(COLOURS, WIDTH, form="all_orders"),
     "VMF diffuse, paper": lj.VMFDiffuse(COLOURS, WIDTH),
     "Oren-Nayar, energy preserving": lj.OrenNayar(COLOURS, WIDTH),
     "Oren-Nayar, classic": lj.OrenNayar(COLOURS, WIDTH, form="classic"),
@@ -54,7 +54,7 @@ def main():
     print()
     for sentence in fits.compare(found).verdict:
         print(sentence)
-    fits.report(found["VMF diffuse, transport"], path=out / "sand.html")
+    fits.report(found["VMF diffuse, all orders"], path=out / "sand.html")
 
 
 if __name__ == "__main__":

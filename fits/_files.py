@@ -8,7 +8,6 @@ import tempfile
 import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
-from io import RawIOBase
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +23,13 @@ def given_path(name: str, path: object) -> Path:
     if not isinstance(path, str | os.PathLike):
         raise ValueError(f"{name}: {' '.join(repr(path).split()):.60} is not the path of a file or directory")
     return Path(path)
+
+
+def require_switch(name: str, value: object, *others: None) -> None:
+    """ValueError for what is neither True nor False, nor None if that is given besides: any text is true."""
+    if not isinstance(value, bool) and not (value is None and others):
+        allowed = "True, False or None" if others else "True or False"
+        raise ValueError(f"{name}: {' '.join(repr(value).split()):.60} is not {allowed}")
 
 
 def require_file(path: Path) -> None:
@@ -52,6 +58,7 @@ def write_bytes(path: str | Path, content: bytes, force: bool = False, durable: 
     durable: the content has reached the disk before it replaces an existing file. An OSError names the file.
     """
     path = given_path("path", path)
+    require_switch("force", force)
     if path.exists() and not force:
         raise ValueError(f"{path}: the file exists already (--force, or force=True, overwrites it)")
     if not path.parent.is_dir():
@@ -128,14 +135,6 @@ def named(path: Path) -> Iterator[None]:
         yield
     except OSError as error:
         raise OSError(error.errno, error.strerror or str(error), str(path)) from None
-
-
-def write_whole(file: RawIOBase, content: bytes, path: Path) -> None:
-    """Write to an unbuffered file; an OSError names it, also if only a part of the content could be written."""
-    rest = memoryview(content)
-    with named(path):
-        while rest:  # after a partial write the rest fails with its reason
-            rest = rest[file.write(rest) :]
 
 
 @contextmanager

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from pathlib import Path
 
-from fits._files import write_text
+from fits._files import require_switch, write_text
 from fits.data.measurements import TO_HAVE_THEM, Measurements
 from fits.maps.report import page
 from fits.maps.store import FittedMap
@@ -48,6 +48,7 @@ def report(
     require_kind("others", others, Mapping, None)
     require_kind("held_out", held_out, Measurements, None, fix=TO_HAVE_THEM)
     require_kind("options", options, ReportOptions)
+    require_switch("force", force)
     if isinstance(fit, FittedMap):
         if posterior is not None or others or held_out is not None:
             raise ValueError("posterior, others, held_out: a map has none; it is reported by itself")

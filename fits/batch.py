@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 from urllib.parse import quote
 
-from fits._files import given_path, named, read_json, require_there, text_checksum, write_text
+from fits._files import given_path, named, read_json, require_switch, require_there, text_checksum, write_text
 from fits.data.formats import sniff
 from fits.data.formats.csv import write_csv
 from fits.data.measurements import Measurements
@@ -182,6 +182,8 @@ def fit_files(
     require_count("starts", starts, 1)
     require_seed(seed)
     require_count("processes", processes, 1)
+    require_switch("reports", reports)
+    require_switch("force", force)
     files, stacks = _several("files", files), _several("stacks", stacks)
     read_options, out, progress = read_options or ReadOptions(), given_path("out", out), given_progress(progress)
     paths, skipped = _measurement_files(files, read_options.format)
@@ -225,8 +227,7 @@ def fit_files(
                 rows[task.key] = outcome
                 progress("fits", count, total, f"{task.path.name} by {task.stack}")
         finally:
-            every = [row if _is_there(out, row) else _removed(row) for row in rows.values()]
-            result = FittedFiles(out, ranked(every), skipped)
+            result = FittedFiles(out, ranked(list(rows.values())), skipped)
             write_text(out / TABLE, table_csv(result.rows), force=True)
             write_text(out / PAGE, page(result), force=True)
     return result
@@ -360,15 +361,6 @@ def _kept_row(job: Job, task: Task, done: Store) -> Row | None:
     except (ValueError, OSError):
         return None
     return None if words else record["row"]
-
-
-def _is_there(out: Path, row: Row) -> bool:
-    """Whether a row has no result, or has it still: others may remove one while the rest are fitted."""
-    return row["result"] == "failed" or (out / row["file"] / row["stack"] / results.FIT).is_file()
-
-
-def _removed(row: Row) -> Row:
-    return Task(Path(row["file"]), "", row["stack"]).failed("its result was removed during the run; run it again")
 
 
 def fit_one(job: Job, task: Task) -> Row:

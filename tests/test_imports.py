@@ -72,7 +72,6 @@ def test_importing_fits_pays_for_nothing_unused():
     assert not loaded_by("import fits") & {
         "arviz",
         "matplotlib",
-        "jaxopt",
         "h5py",
         "zarr",
         "rich",

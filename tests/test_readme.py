@@ -20,6 +20,9 @@ LONG = {"evaluating-0", "own_data-0", "transports-0", "convergence-0"}
 beside walks."""
 
 
+NUMBER = re.compile(r"[-+]?\d+(?:\.\d*)?(?:e[-+]?\d+)?")
+
+
 def blocks(language, pages=PAGES):
     """What stands in fences of that language, with the name of the page and which of its blocks it is."""
     found = [(page.stem, re.findall(rf"```{language}\n(.*?)```", page.read_text(), re.DOTALL)) for page in pages]
@@ -32,10 +35,26 @@ def blocks(language, pages=PAGES):
     ]
 
 
+def printed(code):
+    """What stands below a block as its output; "" where nothing does."""
+    pages = (textwrap.dedent(page.read_text()) for page in PAGES)
+    after = next(page.partition(f"```python\n{code}```\n\n```text\n")[2] for page in pages if code in page)
+    return after.partition("```")[0]
+
+
 @pytest.mark.parametrize("code", blocks("python"))
-def test_python_blocks_run(code, monkeypatch, capsys):
+def test_python_blocks_run_and_print_what_the_page_says(code, monkeypatch, capsys):
     monkeypatch.chdir(ROOT)
     exec(compile(code, "page.md", "exec"), {"__name__": "page"})
+    said, expected = capsys.readouterr().out, printed(code)
+    if not expected:
+        return
+    words = ["".join(NUMBER.sub("#", one).split()) for one in (said, expected)]
+    assert words[0] == words[1]
+    for number, shown in zip(NUMBER.findall(said), NUMBER.findall(expected), strict=True):
+        # in double precision walks and chains draw other numbers: of a hundredth, and a fourth of effective samples
+        digits, rel = len(shown.partition("e")[0].partition(".")[2]), 0.02 if float(shown) < 100.0 else 0.25
+        assert float(number) == pytest.approx(float(shown), rel=rel, abs=1.5 * 10.0**-digits), (said, expected)
 
 
 @pytest.mark.parametrize("text", blocks("toml"))

@@ -3,6 +3,7 @@
 import argparse
 import math
 from collections.abc import Callable, Mapping
+from difflib import get_close_matches
 from types import MappingProxyType
 from typing import Any, NamedTuple, NoReturn
 
@@ -303,17 +304,27 @@ def build_parser() -> argparse.ArgumentParser:
     for name, (what, example, particular, shared, changes) in COMMANDS.items():
         description = f"{what[0].upper()}{what[1:]}."
         command = commands.add_parser(name, help=what, description=description, epilog=f"example: {example}")
-        exclusive = command.add_mutually_exclusive_group()
         for argument, settings in particular.items():
             command.add_argument(argument, **settings)
+        exclusive: argparse._MutuallyExclusiveGroup | None = None
         for option in shared.split():
-            group = exclusive if option in ("--processes", "--scheduler") else command
+            group: Any = command
+            if option in ("--processes", "--scheduler"):  # some versions of Python show no help of an empty group
+                group = exclusive = exclusive or command.add_mutually_exclusive_group()
             group.add_argument(option, **OPTIONS[option] | changes.get(option, {}))
     return parser
 
 
 class _Parser(argparse.ArgumentParser):
-    """Reports an error in one line, as every other error of the command."""
+    """Reports an error in one line, as every other error of the command; of flags first one that there is not."""
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        flags = () if self._subparsers else [word.partition("=")[0] for word in args or () if word.startswith("--")]
+        for flag in flags:
+            if not any(option.startswith(flag) for option in self._option_string_actions):
+                near = get_close_matches(flag, self._option_string_actions, 1)
+                self.error(f"unrecognized argument: {flag}{f'; is it {near[0]}?' if near else ''}")
+        return super().parse_known_args(args, namespace)
 
     def error(self, message: str) -> NoReturn:
         self.exit(2, f"{self.prog}: error: {message} (see {self.prog} --help)\n")

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from fits._files import require_switch
 from fits.data.geometry import TANGENT_COSINE, Floats, Pairs
 from fits.data.selection import Angles, rows_of
 from fits.names import QUANTITIES, Quantity
@@ -194,6 +195,7 @@ class Measurements(Pairs):
             raise ValueError(
                 "select: no argument is given; it takes incidence, azimuth, theta_o, in_plane and channels"
             )
+        require_switch("in_plane", in_plane, None)
         keep = self.mask & rows_of(self, incidence, azimuth, theta_o, in_plane)
         names = self.channels if channels is None else [channels] if isinstance(channels, str) else channels
         return keep, self.of_channels(names).channels

@@ -19,6 +19,8 @@ from dataclasses import dataclass, fields
 from numbers import Real
 from typing import Any, NamedTuple
 
+from fits._files import require_switch
+
 
 @dataclass(frozen=True)
 class Sphere:
@@ -99,6 +101,7 @@ class Spheres:
                 raise ValueError(f"Spheres.{name} is {one!r:.60}, must be a Sphere or None")
         if not (isinstance(self.standard, Real) and 0.0 < float(self.standard) <= 1.0):
             raise ValueError(f"Spheres.standard is {self.standard}, must be in (0, 1]")
+        require_switch("Spheres.together", self.together)
         if self.together and (self.reflection is None or self.transmission is None):
             raise ValueError("Spheres.together: there is only one sphere")
 

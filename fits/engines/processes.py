@@ -8,6 +8,7 @@ import os
 import pickle
 import signal
 import sys
+import warnings
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -96,7 +97,10 @@ def _results(payload: bytes, tasks: list[bytes], count: int) -> Iterator[tuple[i
 
 
 def _outcome(message: bytes) -> Any:
-    outcome = pickle.loads(message)
+    """The result that a worker sends; what it warns of is a warning of this process, and its error raised here."""
+    outcome, warned = pickle.loads(message)
+    for words, category in warned:
+        warnings.warn(words, category, stacklevel=1)
     if isinstance(outcome, Raised):
         raise outcome.error
     return outcome

@@ -27,6 +27,10 @@ READY = b""
 """First message of a worker."""
 
 
+Warned = tuple[str, type[Warning]]
+"""A warning of a task: its words and category."""
+
+
 class Raised(NamedTuple):
     """An error of a task that ends the run."""
 
@@ -84,11 +88,12 @@ def quieten() -> None:
 
 
 def serve(pipe: "connection.Connection") -> None:
-    """Main loop of a worker process: it receives `work` with the common data, then tasks, and sends their results,
-    until the other end is closed."""
+    """Main loop of a worker process: it receives `work` with the common data, then tasks, and sends their results
+    beside the warnings for users, until the other end is closed."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent is interrupted as well, and ends its workers
     threading.Thread(target=_end_with_parent, daemon=True).start()
     quieten()
+    warned = _collect_warnings()
     call: tuple[Any, Any] | None = None
     with suppress(EOFError, BrokenPipeError, ConnectionResetError):
         pipe.send_bytes(READY)
@@ -97,21 +102,34 @@ def serve(pipe: "connection.Connection") -> None:
             task = pipe.recv_bytes()
             try:
                 work, common = call = call or pickle.loads(payload)
-                message = pickle.dumps(attempt(work, common, pickle.loads(task)))
+                message = pickle.dumps((attempt(work, common, pickle.loads(task)), warned))
             except Exception as error:
                 error.add_note(f"in a worker process:\n{traceback.format_exc()}")
-                message = _packed(error)
+                message = pickle.dumps((_portable(error), warned))
+            warned.clear()
             pipe.send_bytes(message)
 
 
-def _packed(error: Exception) -> bytes:
+def _collect_warnings() -> list[Warned]:
+    """A list to which warnings for users are added from now on; others are shown as ever."""
+    usual, warned = warnings.showwarning, list[Warned]()
+
+    def show(message: Warning | str, category: type[Warning], *where: Any, **more: Any) -> None:
+        if not issubclass(category, UserWarning):
+            usual(message, category, *where, **more)
+        else:  # a class of the script that started this process cannot be sent
+            warned.append((str(message), UserWarning if category.__module__ == "__mp_main__" else category))
+
+    warnings.showwarning = show
+    return warned
+
+
+def _portable(error: Exception) -> Raised:
     try:
-        packed = pickle.dumps(Raised(error))
-        pickle.loads(packed)  # some errors can be packed only
-        return packed
+        pickle.loads(pickle.dumps(error))  # some errors can be packed only
+        return Raised(error)
     except Exception:
-        text = "\n".join((f"{type(error).__name__}: {error}", *error.__notes__))
-        return pickle.dumps(Raised(RuntimeError(text)))
+        return Raised(RuntimeError("\n".join((f"{type(error).__name__}: {error}", *error.__notes__))))
 
 
 def _end_with_parent() -> None:

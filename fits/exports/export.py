@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 import layerjax as lj
-from fits._files import given_path, write_bytes
+from fits._files import given_path, require_switch, write_bytes
 from fits.data.geometry import Floats
 from fits.exports import klems, merl, rgl, slices, zemax
 from fits.exports.contents import Contents
@@ -84,6 +84,7 @@ def export(
     if not isinstance(to, str) or to not in EXPORTS:
         raise ValueError(f"to is {in_short(to)}, must be one of {', '.join(EXPORTS)}")
     path = given_path("path", path)
+    require_switch("force", force)
     if path.suffix.lower() != ENDINGS[to]:
         raise ValueError(f"{path}: the name of a file for {to!r} must end in {ENDINGS[to]}")
     if path.exists() and not force:

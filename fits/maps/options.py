@@ -7,6 +7,7 @@ from dataclasses import dataclass, fields
 from numbers import Real
 from typing import Any, Literal, get_args
 
+from fits._files import require_switch
 from fits.names import Objective
 from fits.problem.instrument import Instrument
 from fits.problem.parameters import Free
@@ -131,7 +132,8 @@ class MapOptions:
             _require_number(name, getattr(self, name), 0.0, math.inf)
         for name in ("poor_probability", "pilot_quantile", "converged_share", "flagged_share"):
             _require_number(name, getattr(self, name), 0.0, 1.0)
-        require_choice("emulator", self.emulator, (None, True, False))
+        require_switch("emulator", self.emulator, None)
+        require_switch("force", self.force)
         require_kind("spatial_prior", self.spatial_prior, SpatialPrior, None)
 
     @property

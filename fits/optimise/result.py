@@ -72,7 +72,7 @@ class Fit:
             `errors` and `covariance` are of the best alone; `fits.sample`, `fits.predict` and `fits.evidence` count all
             that hold a share of the posterior.
         insensitive: names of the parameters that the data say nothing about.
-        settings: starts, seed, solver, and the numbers of `FitOptions`.
+        settings: starts, seed, and the numbers of `FitOptions`.
         start_outcomes: how many starts ended where: "best minimum", "local minima", "maximum steps reached", "failed".
         numerical_error: of the model at the best values, in standard deviations of the data (for a named objective, of
             the residuals): the largest, as the difference from a finer resolution tells, or where that is out of reach

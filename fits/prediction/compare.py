@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from fits._files import require_switch
 from fits._lazy import shown_by
 from fits.optimise.result import Fit
 from fits.prediction.cross_validation import ModelScore, model_scores
@@ -93,6 +94,7 @@ def compare(
     """
     require_fits(candidates)
     require_kind("options", options, ComparisonOptions, None)
+    require_switch("refit", refit)
     if len(candidates) < 2:
         raise ValueError(f"compare: {len(candidates)} candidate(s) given; at least 2 are needed")
     fits = {name: entry.fit if isinstance(entry, Posterior) else entry for name, entry in candidates.items()}

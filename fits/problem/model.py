@@ -109,7 +109,7 @@ class Model(eqx.Module):
 
     def cost_at(self, vector: Array, predicted: Array) -> Array:
         """Half the sum of squared residuals."""
-        return half_squares(self.residuals_at(vector, predicted))
+        return 0.5 * jnp.sum(jnp.stack([jnp.sum(part**2) for part in self.residuals_at(vector, predicted)]))
 
     def log_likelihood_per_datum(self, vector: Array) -> Array:
         """`log_likelihood_per_datum_at` what these parameters predict."""
@@ -419,11 +419,6 @@ class JointModel(eqx.Module):
 
 def _column(parts: Sequence[Array]) -> Array:
     return jnp.concatenate([part.reshape(-1) for part in parts])[:, None]
-
-
-def half_squares(residuals: tuple[Array, ...]) -> Array:
-    """Half the sum of the squares of all residuals: the cost that a fit minimises."""
-    return 0.5 * jnp.sum(jnp.stack([jnp.sum(part**2) for part in residuals]))
 
 
 def forward(

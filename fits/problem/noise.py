@@ -19,8 +19,9 @@ import numpy as np
 from jax import Array
 from jax.scipy.special import gammaln
 
+from fits._files import require_switch
 from fits.data.geometry import Floats
-from fits.data.measurements import Measurements
+from fits.data.measurements import LARGEST, Measurements
 from fits.names import Objective
 from fits.problem.discrepancy import Discrepancy, Process, size, softness
 from fits.problem.parameters import Free, is_free, require_number_or_free
@@ -64,7 +65,7 @@ class Noise:
             require_number_or_free("Noise.relative", self.relative, 0.0, 1.0)
         if self.floor is not None and not (isinstance(self.floor, Real) and self.floor == 0.0):
             require_number_or_free("Noise.floor", self.floor, *LEVELS)
-        require_choice("Noise.use_sigma", self.use_sigma, (True, False))
+        require_switch("Noise.use_sigma", self.use_sigma)
         require_choice("Noise.tails", self.tails, get_args(Tails))
         require_number("Noise.degrees_of_freedom", self.degrees_of_freedom, *DEGREES_OF_FREEDOM)
         if self.discrepancy is True:
@@ -146,6 +147,8 @@ class Levels(NamedTuple):
     variance: Floats
     relative: float | Free
     floor: float | Free
+    floor_is_share: bool
+    """Whether the floor is a share of the values, by default."""
 
     @property
     def smallest(self) -> Floats:
@@ -172,7 +175,7 @@ class Levels(NamedTuple):
         """What measurements (N, C) tell of a process of the discrepancy; None where it depends on parameters."""
         if self.fitted:
             return None
-        variance, relative, floor = (jnp.asarray(level) for level in self)
+        variance, relative, floor = (jnp.asarray(level) for level in self[:3])
         sigma = total_sigma(jnp.asarray(values), variance, relative, floor)
         return process.gram_of(size(values, self.softness(values)) / sigma)
 
@@ -191,4 +194,17 @@ def noise_levels(noise: Noise, used: Measurements) -> Levels:
     if floor is None:
         alone = not is_free(relative) and relative == 0
         floor = 0.0 if alone else DEFAULT_FLOOR * float(np.median(np.abs(used.values)))
-    return Levels(np.zeros(1) if sigma is None else np.square(sigma), relative, floor)
+    return Levels(np.zeros(1) if sigma is None else np.square(sigma), relative, floor, noise.floor is None)
+
+
+def require_size(levels: Levels) -> None:
+    """Refuse values of which a share has a square that vanishes or overflows."""
+    if not levels.floor_is_share or isinstance(levels.floor, Free) or levels.floor == 0:
+        return
+    precision, median = jnp.finfo(jnp.result_type(float)), levels.floor / DEFAULT_FLOOR
+    least, most = max(LEVELS[0], math.sqrt(precision.tiny)) / DEFAULT_FLOOR, min(LARGEST, math.sqrt(precision.max))
+    if not least <= median <= most:
+        raise ValueError(
+            f"values: the median of |value| is {median:.3g} 1/sr; for noise relative to them it must be in "
+            f"[{least:.2g}, {most:.2g}], or Noise.floor be given"
+        )

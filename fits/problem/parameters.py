@@ -22,8 +22,9 @@ from jax import Array
 from scipy import stats
 
 import layerjax as lj
+from fits._files import require_switch
 from fits.data.geometry import Floats
-from layerjax._checks import in_short, require_choice, require_kind, require_number
+from layerjax._checks import in_short, require_kind, require_number
 from layerjax._shown import Shown
 from layerjax.mixture import stacks_by_name
 
@@ -186,7 +187,7 @@ class Free:
         if self.prior is None:
             object.__setattr__(self, "prior", Uniform())
         require_kind("Free.prior", self.prior, Uniform, LogUniform, Normal, LogNormal)
-        require_choice("Free.same_for_all_texels", self.same_for_all_texels, (True, False))
+        require_switch("Free.same_for_all_texels", self.same_for_all_texels)
         for field in ("start", "low", "high", "random_walk_sd"):
             if (value := getattr(self, field)) is not None or field != "random_walk_sd":
                 object.__setattr__(self, field, _plain(f"Free.{field}", value))

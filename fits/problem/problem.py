@@ -31,7 +31,7 @@ from fits.problem.discrepancy import Discrepancy, Process, make_process, numbers
 from fits.problem.hemispherical import Totalling
 from fits.problem.instrument import Instrument, optics_of, setting_of
 from fits.problem.model import JointModel, Model, Transport
-from fits.problem.noise import Levels, Noise, is_assumed, noise_levels
+from fits.problem.noise import Levels, Noise, is_assumed, noise_levels, require_size
 from fits.problem.parameters import Box, Free, LogNormal, Normal, is_free, names_of, require_in_range, split
 from layerjax._checks import in_short, require_choice, require_kind, require_number
 from layerjax._parameters import plain_name
@@ -448,6 +448,7 @@ def _require_kinds(problem: Problem) -> None:
 def _require_weights(objective: Objective, levels: Levels, process: Process | None, free: Mapping[str, Free]) -> None:
     """A likelihood needs noise; beside a named residual nothing may stand that only a likelihood weighs."""
     if objective == "likelihood":
+        require_size(levels)
         if not np.all(levels.smallest > 0):
             raise ValueError("noise: sigma could become 0; give a floor above 0, or data with sigma")
         return

@@ -19,7 +19,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from fits._files import given_path, locked, read_json, require_there, text_checksum, write_json, write_text
+from fits._files import (
+    given_path,
+    locked,
+    read_json,
+    require_switch,
+    require_there,
+    text_checksum,
+    write_json,
+    write_text,
+)
 from fits.data.formats import totals_csv
 from fits.data.formats.csv import write_csv
 from fits.data.measurements import Measurements, Source
@@ -289,6 +298,7 @@ def writing(directory: str | Path, force: bool = False) -> Iterator[Path]:
         ValueError: another process writes it; or it is not empty, unless `force` is given and it is an earlier result.
     """
     directory = given_path("directory", directory)
+    require_switch("force", force)
     check_directory(directory, force)
     target = directory.resolve()
     folder, old = target.with_name(f".{target.name}.layerjax-new"), target.with_name(f".{target.name}.layerjax-old")

@@ -12,15 +12,18 @@ import numpy as np
 
 from fits.data.geometry import Floats
 from fits.optimise.result import Fit
-from fits.problem.compilation import cores, in_shares, one_thread
+from fits.problem.compilation import one_thread
 from fits.sampling.chain import Chain
-from fits.sampling.initial import first_positions, initial_mixture, log_posteriors
+from fits.sampling.initial import first_positions, initial_mixture, log_posteriors, share_of
 from fits.sampling.mixture import Mixture
 from fits.sampling.options import SamplerOptions
 from fits.sampling.proposals import Density, FittedProposal, propose
 
 FITS = (25 * 1.5 ** np.arange(40.0)).astype(int)
 """Steps after which proposals are fitted again: often while the chain is short, seldom once it is long."""
+
+FEWEST = 1000
+"""Draws that a density is fitted to, at least: on a ridge one that is fitted to fewer is worse than the first."""
 
 DIFFERENCE = 1.2
 """Length of differential evolution, where 2.38 is best for a normal posterior: curved ones are narrower than they are
@@ -32,9 +35,9 @@ class Ensemble:
 
     def __init__(self, fit: Fit, chain: Chain, seed: int, options: SamplerOptions):
         self.problem, self.chain, self.seed, self.options = fit.problem, chain, seed, options
-        self._compiled = False
+        self.share, self._compiled = share_of(chain.shape[0]), False
         if not chain.moves:
-            chain.decide({"initial": initial_mixture(fit, options.smallest_mode).record()})
+            chain.decide({"initial": initial_mixture(fit, self.share, options.smallest_mode).record()})
 
     def advance(self, step: int, show: Callable[[], None]) -> None:
         """Append steps to the chain until it has `step` of them, and `show` each."""
@@ -56,11 +59,7 @@ class Ensemble:
                 show()
 
     def log_posteriors(self, positions: Floats) -> Floats:
-        """At positions (count, P), on all cores: half of the walkers, which move together, are a share for each."""
-        share = max(1, self.chain.shape[0] // (2 * cores()))
-        (found,) = in_shares(
-            lambda part: [self.problem.call(log_posteriors, part)], positions, share, compiled=self._compiled
-        )
+        found = log_posteriors(self.problem, positions, self.share, self._compiled)
         self._compiled = True
         return found
 
@@ -79,7 +78,7 @@ def proposals_of(chain: Chain) -> Density:
     fits only.
     """
     initial, last = Mixture(**chain.moves["initial"]), FITS[chain.iteration >= FITS].max(initial=0)
-    if not last:
+    if (last - last // 2) * chain.shape[0] < FEWEST:
         return initial
     positions = chain.chain[last // 2 : last].reshape(-1, chain.shape[-1])
     with one_thread():  # the same to the last bit, whatever else runs

@@ -11,6 +11,7 @@ from scipy.special import expit, logit
 
 from fits.data.geometry import Floats
 from fits.optimise.uncertainty import local_information, square
+from fits.problem.compilation import on_all_cores
 from fits.problem.problem import Problem
 
 OPEN = 0.1  # boxes: a posterior that is wider may bend
@@ -61,11 +62,11 @@ def ridge(problem: Problem, optimum: Floats, free: NDArray[np.bool_]) -> Ridge:
     found, turn = [best], 0
     tangents = [_axes(best, free, dimension)[2]]
     while dimension and turn < len(found) < MOST_POINTS:
-        for move in np.concatenate([tangents[turn], -tangents[turn]]) * step:
-            ahead = _moved(found[turn].place, free, move)
-            if _distance(ahead, found) < CLOSE * step:
-                continue
-            reached, tangent = _brought_back(problem, ahead, free, dimension, step)
+        moves = np.concatenate([tangents[turn], -tangents[turn]]) * step
+        ahead = [_moved(found[turn].place, free, move) for move in moves]
+        fresh = [place for place in ahead if _distance(place, found) >= CLOSE * step]
+        back = on_all_cores(lambda place: _brought_back(problem, place, free, dimension, step), fresh)
+        for reached, tangent in back:
             if _distance(reached.place, found) > CLOSE * step and reached.cost < best.cost + AS_HIGH:
                 found.append(reached)
                 tangents.append(tangent)

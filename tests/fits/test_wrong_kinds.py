@@ -2,14 +2,17 @@
 
 import dataclasses
 import importlib
+import inspect
 import math
 import pkgutil
+from functools import partial
 
 import numpy as np
 import pytest
 
 import fits
 import layerjax as lj
+from tests.helpers.data_files import RXT
 
 STACK = lj.Stack([], lj.Lambertian(fits.Free(0.5, 0.0, 1.0)))
 PLAIN = lj.Stack([], lj.Lambertian(0.5))
@@ -137,6 +140,38 @@ def test_unfit_arguments_are_refused_by_name(name, argument, kind, tmp_path, mon
     assert "\n" not in str(caught.value)
     assert len(str(caught.value)) < 300
     assert not list(tmp_path.iterdir())
+
+
+BY_THE_PROGRAM = ("Fit", "Posterior", "Search")
+"""Results, which nobody else makes."""
+
+SWITCHES = [
+    (name, one.name, "None" in str(one.annotation))
+    for name in fits.__all__
+    if callable(getattr(fits, name)) and name not in BY_THE_PROGRAM
+    for one in inspect.signature(getattr(fits, name)).parameters.values()
+    if one.annotation in (bool, bool | None, "bool", "bool | None")
+]
+
+
+@pytest.mark.parametrize(("name", "argument", "optional"), SWITCHES)
+def test_a_switch_is_true_or_false(name, argument, optional, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "slab.rxt").write_text(RXT.format(spheres=0) + "1\n0.3\n")
+    call, more = getattr(fits, name), KEYWORDS.get(name, (FUNCTIONS.get(name, {}), ""))[0]
+    if name in ("read_slab", "ReadOptions"):  # options are looked at as the file is read
+        call = partial(fits.read if name == "ReadOptions" else fits.read_slab, "slab.rxt")
+    for given in ("no", 0, *(() if optional else (None,))):
+        with pytest.raises(ValueError, match=rf"{argument}: {given!r} is not True.* or ") as caught:
+            call(**MORE.get(name, {}) | more | {argument: given})
+        assert "\n" not in str(caught.value)
+    assert [path.name for path in tmp_path.iterdir()] == ["slab.rxt"]
+
+
+def test_so_are_those_of_measurements():
+    for method in (DATA.select, DATA.drop):
+        with pytest.raises(ValueError, match="in_plane: 'no' is not True, False or None"):
+            method(in_plane="no")
 
 
 @pytest.mark.parametrize("given", [np.ones((3, 3)), "data.csv", None])

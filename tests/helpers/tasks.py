@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -35,6 +36,14 @@ def picky(shared: Any, task: int) -> int:
 
 def nothing(shared: Any, task: Any) -> None:
     """What it costs to ask."""
+
+
+def warned(shared: Any, task: int) -> None:
+    """Warns users of the same whatever the task, and once of its own."""
+    from layerjax import ResolutionWarning
+
+    for words in ("too narrow", f"task {task}"):
+        warnings.warn(words, ResolutionWarning, stacklevel=1)
 
 
 def deadly(shared: str, task: int) -> int:
@@ -80,9 +89,15 @@ def surroundings(shared: Any, task: Any) -> dict[str, Any]:
 
 @contextmanager
 def started(words: list[str], *paths: Path) -> Iterator[subprocess.Popen[str]]:
-    """A program of Python in a process group of its own, with these paths to import from; killed in the end."""
+    """A program of Python in a process group of its own, with these paths to import from; killed in the end.
+
+    It finds the programs that tests have compiled, and adds none: it may be killed as it writes one.
+    """
+    import jax
+
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(map(str, (*paths, ROOT)))}
-    environment |= {"DASK_LOGGING__DISTRIBUTED": "critical"}
+    environment |= {"DASK_LOGGING__DISTRIBUTED": "critical", "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "inf"}
+    environment["JAX_COMPILATION_CACHE_DIR"] = str(jax.config.values["jax_compilation_cache_dir"])
     before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a background job's ignoring is inherited
     try:
         pipes: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}

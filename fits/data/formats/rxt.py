@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fits._files import given_path, require_file
+from fits._files import given_path, require_file, require_switch
 from fits.data.formats._text import Line, plural, read_lines
 from fits.data.geometry import Floats
 from fits.data.measurements import Source
@@ -141,6 +141,7 @@ def read_slab(
     """
     path = given_path("path", path)
     require_file(path)
+    require_switch("corrected", corrected, None)
     lines = read_lines(path)
     words = [word for line in lines for word in _words(line)]
     if not words or words[0][1] != FIRST:

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jax import Array
 from jax.typing import ArrayLike
 
+from layerjax._checks import require_choice
 from layerjax._numerics import at_least, at_most, safe_div, safe_sqrt
 from layerjax._parameters import Parameter, is_placeholder, parameter
 from layerjax.channels import per_channel
@@ -22,15 +23,10 @@ from layerjax.surfaces.lambertian import sample_cosine
 from layerjax.surfaces.vmf_diffuse.all_orders import all_orders_brdf
 from layerjax.surfaces.vmf_diffuse.paper import flake_albedo, paper_brdf
 
-Form = Literal["paper", "literal", "all_orders", "transport"]
-"""See `VMFDiffuse`; "transport" is the former name of "all_orders", and stands for it."""
+Form = Literal["paper", "literal", "all_orders"]
 
 NODES = 32
 """Cosines of the albedo at normal incidence."""
-
-
-def _current_name(form: Form) -> Form:
-    return "all_orders" if form == "transport" else form
 
 
 class VMFDiffuse(Surface):
@@ -44,8 +40,7 @@ class VMFDiffuse(Surface):
     form             "paper" or       "paper" the paper's fit; light scattered four and more times by Eq. (9) with
                      "literal" or             the exponent atan(X erf(C)) ("paper") or atan(X) erf(C) as printed
                      "all_orders"             ("literal"; 3 % of that part, 0.0017 in value, at most); or a table
-                                              of what such flakes reflect in all orders ("all_orders", once called
-                                              "transport", which is still taken for it)
+                                              of what such flakes reflect in all orders ("all_orders")
     ========= ====== ================ ======= ======================================================================
 
     The fits follow the flakes' own reflection to 1 to 4 % (root mean square), and do not conserve energy: at albedo 1
@@ -61,11 +56,10 @@ class VMFDiffuse(Surface):
 
     albedo: Parameter = parameter("VMFDiffuse.albedo")
     roughness: Parameter = parameter("VMFDiffuse.roughness")
-    form: Form = eqx.field(static=True, default="paper", converter=_current_name)
+    form: Form = eqx.field(static=True, default="paper")
 
     def __check_init__(self) -> None:
-        if self.form not in get_args(Form):
-            raise ValueError(f'VMFDiffuse.form: {self.form!r} is not one of "paper", "literal", "all_orders"')
+        require_choice("VMFDiffuse.form", self.form, get_args(Form))
 
     def evaluate(self, wi: Vector, wo: Vector) -> tuple[Array, ...]:
         albedos = per_channel(self.albedo)

@@ -218,6 +218,10 @@ LINE_DATA = measured(VALUES)
         (lambda: Problem({"a": 0.1, "b": 0.2}, LINE_DATA, line), "nothing is free"),
         (lambda: Problem(STACK, measured(VALUES, mask=np.zeros(COUNT, bool)), line), "no sample is used"),
         (lambda: Problem(STACK, LINE_DATA, line, Noise(relative=0.0, floor=0.0)), "sigma could become 0"),
+        (
+            lambda: Problem(STACK, measured(1e-300 * np.ones_like(VALUES)), line),
+            r"^values: the median of \|value\| is 1e-300 1/sr; .* must be in \[1e-96, 1e\+30\], or Noise.floor",
+        ),
         (lambda: Problem(STACK, LINE_DATA, line, objective="l1"), "objective: 'l1' is not one of 'likelihood', "),
         (lambda: Problem(STACK, LINE_DATA, line, scale=-1.0), "scale is -1.0"),
         (lambda: Problem(STACK, LINE_DATA, line, objective="cube_root"), "the prior Normal.* has no weight beside"),

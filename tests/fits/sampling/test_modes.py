@@ -122,7 +122,7 @@ def test_errors_of_one_of_several_minima_are_said_to_be(fitted: Fit) -> None:
 def test_minima_that_hold_next_to_nothing_are_no_modes() -> None:
     found = pair_fit(Normal(0.3, 0.25))  # the other is 11 lower in the log-posterior
     assert len(found.minima) >= 2
-    assert initial_mixture(found).mode_count == 1
+    assert initial_mixture(found, 8).mode_count == 1
 
 
 def test_walkers_that_stay_where_they_are_have_not_converged() -> None:

@@ -93,4 +93,4 @@ def test_the_command_samples_with_it(
     assert posterior is not None
     assert posterior.chain.shape[:2] == (200, 4)
     assert main(["sample", "result", "--sampler", "emcee"]) == 2
-    assert "--sampler is emcee, the chain in result/chain.db has nuts" in capsys.readouterr().err
+    assert "(sampler nuts, not emcee, walkers 4, not 32)" in capsys.readouterr().err

@@ -111,7 +111,7 @@ def test_a_parameter_on_its_bound_has_a_truncated_posterior() -> None:
 
 def test_proposals_are_learned_from_the_chain(result: Fit) -> None:
     """A Gaussian far from the fit's own approximation, which keeps a share of them."""
-    initial, generator = initial_mixture(result), np.random.RandomState(0)
+    initial, generator = initial_mixture(result, 8), np.random.RandomState(0)
     law = stats.multivariate_normal(initial.centre[0] + 6.0, [[0.5, 0.3], [0.3, 0.4]])
     chain = Chain(16, 2)
     chain.decide({"initial": initial.record()})

@@ -97,18 +97,23 @@ def test_albedo_over_metal_is_the_mean_of_walks(alpha):
     np.testing.assert_allclose(found, walks, rtol=3e-3)
 
 
-def test_slope_of_the_albedo_of_a_narrow_lobe_is_that_of_a_mirror():
+def test_albedo_of_a_narrow_lobe_and_its_slope_are_those_of_a_mirror():
+    """0.0414 and, at alpha 0.003, 2 % more than 0.04 were found with 12 nodes, which do not resolve the lobe."""
+
     @jax.jit
-    def slope(ior, alpha):
+    def both(ior, alpha):
         def reflected(ior):
             stack = lj.Stack([lj.Interface(ior, alpha)], lj.Lambertian(0.0))
             return lj.albedo(stack, towards(0.0), transport=lj.AddingDoubling(6, 4))[0][0]
 
-        return jax.jvp(reflected, (ior,), (jnp.ones(()),))[1]
+        return jax.jvp(reflected, (ior,), (jnp.ones(()),))
 
     ior = 1.5
     for alpha in (0.003, 0.01):
-        np.testing.assert_allclose(slope(ior, alpha), 4.0 * (ior - 1.0) / (ior + 1.0) ** 3, rtol=2e-4)
+        value, slope = both(ior, alpha)
+        np.testing.assert_allclose(value, ((ior - 1.0) / (ior + 1.0)) ** 2, rtol=2e-4)
+        np.testing.assert_allclose(slope, 4.0 * (ior - 1.0) / (ior + 1.0) ** 3, rtol=2e-4)
+    np.testing.assert_allclose(both(ior, 0.05)[0], 0.0399214, rtol=1e-3)  # by quadrature over its facets
 
 
 @pytest.mark.slow  # `test_stiff` is quicker

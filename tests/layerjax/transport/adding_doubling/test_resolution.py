@@ -83,6 +83,10 @@ def test_neighbours_are_coarser_and_finer():
     assert Resolution(2, 1, (2, 4)).coarser() == Resolution(2, 1, (2, 4))
 
 
+BARE = ("haze on metal", "bare flakes")
+"""Whose light comes from any inclination: 14 of 133 ordinary stacks had broken 1e-3, most of them of these kinds."""
+
+
 def random_stack(kind, seed):
     random = np.random.default_rng(seed)
     face = lj.Interface(random.uniform(1.2, 1.9), np.exp(random.uniform(np.log(0.02), np.log(0.8))))
@@ -96,11 +100,28 @@ def random_stack(kind, seed):
         "coated metal": lj.Stack([face], lj.Conductor(random.uniform(0.2, 2.0), random.uniform(1.5, 5.0), alpha)),
         "flakes": lj.Stack([face, flakes(alpha)], lj.Lambertian(random.uniform(0.1, 0.95))),
         "slab": lj.Stack([face, haze, below]),
+        "haze on metal": lj.Stack([haze], lj.Conductor(random.uniform(0.2, 2.0), random.uniform(1.5, 5.0), alpha)),
+        "bare flakes": lj.Stack([flakes(max(alpha, 0.2))], lj.Lambertian(random.uniform(0.1, 0.95))),
     }[kind]
 
 
+def test_lying_fibers_that_are_too_narrow_are_told():
+    with pytest.warns(lj.ResolutionWarning, match="24 x 44 ordinates, where about 50 cosines are needed"):
+        lj.choose_transport(lj.Stack([lj.Medium(1.0, 0.9, lj.SGGX("fiber", 0.1, (1.0, 0.0, 0.0)))], PAINT))
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["paint", "coated metal", "flakes", "slab"])
+def test_narrow_flakes_at_grazing_light():
+    """They were off by 12 %; to 5e-3 of a finer solution, at which it stays where values are small."""
+    grazing = lj.direction(np.radians([78.0, 80.0])[:, None, None], 0.0)
+    wo = lj.direction(np.radians([30.0, 60.0, 78.0, 80.0])[:, None], np.radians([0.0, 60.0, 150.0, 180.0]))
+    stack = lj.Stack([flakes(0.1)], PAINT)
+    exact = lj.evaluate(stack, grazing, wo, lj.AddingDoubling(nodes=32, modes=256))
+    np.testing.assert_allclose(lj.evaluate(stack, grazing, wo), exact, rtol=5e-3)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["paint", "coated metal", "flakes", "slab", "haze on metal", "bare flakes"])
 def test_errors_of_random_stacks(kind):
     """1e-3 is what is aimed at: half of the stacks are below it, and none is beyond five times that."""
     theta, phi = np.radians([5.0, 30.0, 55.0, 75.0]), np.radians([0.0, 60.0, 150.0])
@@ -111,7 +132,7 @@ def test_errors_of_random_stacks(kind):
         wi, wo = lj.direction(theta[:, None, None], 0.0), lj.direction(outgoing[:, None], phi)
         found, exact = (
             np.asarray(lj.evaluate(stack, wi, wo, transport))
-            for transport in (lj.AddingDoubling(), lj.AddingDoubling(nodes=40, modes=56))
+            for transport in (lj.AddingDoubling(), lj.AddingDoubling(nodes=40, modes=160 if kind in BARE else 56))
         )
         errors.append(np.max(np.abs(found - exact) / (exact + 0.1 * np.mean(exact))))
     assert np.median(errors) < 1e-3

@@ -34,6 +34,10 @@ OTHERS = {
         (1.5, 0.3, 0.3),
         lambda p: lj.Stack([lj.Interface(p[0], p[1], "vmf")], lj.Conductor(0.2, 3.5, p[2], "vmf")),
     ),
+    "vmf coat on paint": (
+        (1.5, 0.3, 0.5),
+        lambda p: lj.Stack([lj.Interface(p[0], p[1], "vmf")], lj.Lambertian(p[2])),
+    ),
     "two coats on metal": (
         (1.5, 0.3, 1.2, 0.2),
         lambda p: lj.Stack([lj.Interface(p[0], p[1]), lj.Interface(p[2], p[3])], lj.Conductor(0.2, 3.5, 0.3)),
@@ -46,7 +50,7 @@ REVERSE = ("flakes", "haze on metal", "low coat on paint")
 """Whose gradients compile fast."""
 
 
-SHORT_ONES = ("flakes", "low coat on paint")
+SHORT_ONES = ("flakes",)
 """Whose programs do as well. Those of a hazy coat are compared with differences in `test_known_directions`, and light
 that passes a slab straight is in `test_ballistic`."""
 
@@ -139,12 +143,13 @@ def test_slopes_of_many_stacks_are_those_of_differences(kind, known):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", STRUCTURES)
+@pytest.mark.parametrize("kind", [*STRUCTURES, "vmf coat on paint"])
 def test_slopes_at_the_default_resolution(kind):
-    """To 1 % of |f| of those at twice the nodes and modes."""
+    """To 1 % of |f| of those at twice the nodes and modes. By the width of von Mises-Fisher normals the slope had been
+    0.0093 where 0.0253 is right."""
     wi, wo = pairs(kind)
     found = []
-    for seed in range(4):
+    for seed in range(4 if kind in STRUCTURES else 1):
         numbers = numbers_of(kind, seed)
         usual = lj.choose_transport(build_of(kind)(numbers), wi, wo)
         fine = dataclasses.replace(usual, nodes=2 * usual.nodes, modes=min(2 * usual.modes, 96))
