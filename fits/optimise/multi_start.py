@@ -21,7 +21,7 @@ import layerjax
 from fits.optimise.levenberg_marquardt import COST_TOLERANCE, ROUGH_TOLERANCE, Descent, descent, evaluate_at
 from fits.optimise.uncertainty import Uncertainty, uncertainty
 from fits.problem.compilation import cores
-from fits.problem.model import Density
+from fits.problem.model import Model
 from fits.problem.problem import FittingProblem
 from fits.progress import Progress
 from fits.store import Store, fingerprint
@@ -253,7 +253,7 @@ def polish(
     # 5. the reduced chi-square where it is above 1; of a named objective, the residual variance
     freedom = max(problem.count - len(lowest.vector), 1)
     if likelihood:
-        excess = max(1.0, float(problem.call(Density.chi_square_at, lowest.vector, predicted)) / freedom)
+        excess = max(1.0, float(problem.call(Model.chi_square_at, lowest.vector, predicted)) / freedom)
         excess = excess if problem.count > len(lowest.vector) else 1.0
     else:
         excess = 2.0 * lowest.cost / freedom

@@ -23,7 +23,7 @@ from fits.optimise.multi_start import Optimum, StartOutcome, polish, rough_desce
 from fits.optimise.options import FitOptions
 from fits.problem.apertures import most_rings
 from fits.problem.instrument import rings_for
-from fits.problem.model import Density, Model
+from fits.problem.model import Model
 from fits.problem.problem import FittingProblem, Problem
 from fits.progress import Progress
 from layerjax.mixture import stacks_of
@@ -384,7 +384,7 @@ def _fitted_again(
     """The ends at another resolution: those that matter fitted again, the cost of the others there."""
 
     def cost(end: StartOutcome) -> float:
-        found = float(problem.call(Density.cost_at, end.vector, problem.predict(end.vector)))
+        found = float(problem.call(Model.cost_at, end.vector, problem.predict(end.vector)))
         return found if np.isfinite(found) else np.inf
 
     # 1. ends that lie close together count as one, lowest first

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import logsumexp
 
+from fits.data.geometry import Floats
 from fits.optimise.result import Fit
 from fits.prediction.options import ComparisonOptions
 from fits.sampling.initial import initial_mixture, log_posteriors
@@ -36,8 +37,6 @@ DRAWS = 1000
 
 BATCH = 50
 """Draws that a core evaluates at a time: however many there are, one program serves."""
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

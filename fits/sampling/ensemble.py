@@ -9,8 +9,8 @@ from functools import partial
 
 import emcee
 import numpy as np
-from numpy.typing import NDArray
 
+from fits.data.geometry import Floats
 from fits.optimise.result import Fit
 from fits.problem.compilation import one_thread
 from fits.sampling.chain import Chain
@@ -28,8 +28,6 @@ FEWEST = 1000
 DIFFERENCE = 1.2
 """Length of differential evolution, where 2.38 is best for a normal posterior: curved ones are narrower than they are
 long."""
-
-Floats = NDArray[np.float64]
 
 
 class Ensemble:
@@ -55,7 +53,7 @@ class Ensemble:
             sampler = emcee.EnsembleSampler(
                 *self.chain.shape, self.log_posteriors, moves=moves, vectorize=True, backend=self.chain
             )
-            count = min(step, next_fit(begin)) - begin
+            count = min(step, int(FITS[begin < FITS].min())) - begin  # until proposals are fitted again
             # walkers are drawn from a density of full rank: emcee need not look whether they are
             for _ in sampler.sample(state, iterations=count, skip_initial_state_check=True):
                 show()
@@ -85,8 +83,3 @@ def proposals_of(chain: Chain) -> Density:
     positions = chain.chain[last // 2 : last].reshape(-1, chain.shape[-1])
     with one_thread():  # the same to the last bit, whatever else runs
         return FittedProposal.to(positions.copy(), np.random.RandomState(last), initial)
-
-
-def next_fit(step: int) -> int:
-    """The first step after this one that proposals are fitted at again."""
-    return int(FITS[step < FITS].min())

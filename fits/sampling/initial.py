@@ -15,6 +15,7 @@ from jax import Array
 from numpy.typing import NDArray
 from scipy.special import logit, logsumexp
 
+from fits.data.geometry import Floats
 from fits.optimise.multi_start import least_squares_descent, unit_of
 from fits.optimise.result import Fit, Minimum
 from fits.optimise.uncertainty import local_information, uncertainty
@@ -33,8 +34,6 @@ PRESSED = 10.0  # unless the log-posterior falls by more than this from the boun
 APART = 3.0  # standard deviations: minima that are closer are one mode
 MOST_MODES = 8
 LOWEST_MINIMUM = 8.0  # in the log-posterior, below the best: what lies lower holds next to nothing, however broad it is
-
-Floats = NDArray[np.float64]
 
 
 def initial_mixture(

@@ -14,8 +14,8 @@ import emcee
 import jax
 import numpy as np
 from jax import Array
-from numpy.typing import NDArray
 
+from fits.data.geometry import Floats
 from fits.optimise.result import Fit
 from fits.problem.compilation import cores, in_shares
 from fits.problem.model import Model
@@ -29,8 +29,6 @@ from fits.sampling.proposals import propose
 
 CHAINS = 4
 DRAWS = 4096  # of the approximation, for its covariance
-
-Floats = NDArray[np.float64]
 
 
 def require_blackjax() -> None:

@@ -13,7 +13,7 @@ from fits._files import locked
 from fits.prediction import cross_validation
 from fits.problem.compilation import cores
 from fits.problem.noise import Noise
-from fits.problem.parameters import Free, split
+from fits.problem.parameters import Free, names_of, split
 from fits.store import Store
 from fits.structure_search import STORE, Library, SearchOptions, default_library, read_library, search
 from tests.helpers.files import contents
@@ -191,7 +191,7 @@ def test_stacks_of_the_default_are_put_together_from_the_top():
         library = default_library(channels)
         for base in library.bases:
             assert all(split(library.stack((layer, base)))[1] for layer in library.layers)
-        names = split(library.stack(("particles", "diffuse")))[1]
+        names = names_of(split(library.stack(("particles", "diffuse")))[1])
         assert sum("albedo" in name for name in names) == 2 * channels
 
 
