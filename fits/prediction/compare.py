@@ -105,7 +105,9 @@ def compare(
     rows = [replace(_row(name, fit), **loo.get(name, {})) for name, fit in fits.items()]
     if refit:
         scores = model_scores(fits, progress, options)
-        rows = sorted((replace(row, model_score=scores[row.name]) for row in rows), key=lambda row: -_score(row).elpd)
+        rows = [
+            replace(row, model_score=scores[row.name]) for row in sorted(rows, key=lambda row: -scores[row.name].elpd)
+        ]
         sorted_by = "elpd"
     elif loo:
         rows.sort(key=lambda row: -row.loo)
@@ -170,11 +172,6 @@ def _row(name: str, fit: Fit) -> ComparedFit:
     )
 
 
-def _score(row: ComparedFit) -> ModelScore:
-    assert row.model_score is not None
-    return row.model_score
-
-
 def _verdict(best: ComparedFit, other: ComparedFit, sorted_by: str, options: ComparisonOptions) -> str:
     """One sentence on whether the data prefer one fit to another.
 
@@ -188,8 +185,7 @@ def _verdict(best: ComparedFit, other: ComparedFit, sorted_by: str, options: Com
         )
     excess = max(1.0, best.reduced_chi_square) if best.degrees_of_freedom > 0 else 1.0
     scaled = f" (noise scaled to the residuals of {best.name})" if excess > 1.0 else ""
-    if sorted_by == "elpd":
-        score = _score(other)
+    if (score := other.model_score) is not None:
         difference = 2.0 * score.clear_diff
         words = f"elpd difference {score.elpd_diff:.1f} ± {score.dse:.1f} by cross-validation"
     elif sorted_by == "loo":

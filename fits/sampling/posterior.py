@@ -136,11 +136,8 @@ class Posterior:
         self._require_converged()
         kept = after_burn_in(self.chain, self.options).reshape(-1, len(self.names))
         median, low, high = np.quantile(kept, [0.5, 0.158655, 0.841345], axis=0)
-        columns = (median, low, high, kept.mean(axis=0), kept.std(axis=0))
-        return {
-            name: (float(a), float(b), float(c), float(d), float(e))
-            for name, a, b, c, d, e in zip(self.names, *columns, strict=True)
-        }
+        rows = np.stack([median, low, high, kept.mean(axis=0), kept.std(axis=0)], axis=-1).tolist()
+        return {name: (row[0], row[1], row[2], row[3], row[4]) for name, row in zip(self.names, rows, strict=True)}
 
     @cached_property
     def inference_data(self) -> "InferenceData":
