@@ -4,10 +4,10 @@
 ``error-vs-time`` (every model against the truth, over the suite of stacks), ``references`` (the solver and the walk
 beside PythonicDISORT and Mitsuba), ``statistics`` (directional statistics, lobe by lobe, beside the walk),
 ``spongecake`` (its multiple scattering beside the truth: held-out materials, energy, figures, fits), ``endf`` (thin
-coats beside a walk of one bounce), ``rough-diffuse`` (rough diffuse surfaces beside each other), ``unseen`` (how well
-stacks foretell readings of real coatings that were not fitted), ``wrong-stacks`` (whether bands hold where a simulated
-material is fitted by another), ``pulls`` (whether instruments, mixtures and bins of tables give parameters and honest
-errors), ``structures`` (whether a search finds the stack behind simulated data),
+coats beside a walk of one bounce), ``rough-diffuse`` (rough diffuse surfaces beside each other), ``held-out`` (how well
+stacks predict held-out measurements of real coatings), ``wrong-stacks`` (coverage of prediction intervals where a
+simulated material is fitted by a wrong stack), ``pulls`` (whether instruments, mixtures and bins of tables give
+parameters and honest errors), ``structures`` (whether a search finds the stack behind simulated data),
 ``accelerator`` (a GPU beside the processor) and ``side-by-side`` (which transport when: a page of docs from the results
 of error-vs-time)."""
 
@@ -20,16 +20,16 @@ from pathlib import Path
 from typing import Any
 
 NAMES = ("throughput", "textured", "maps", "recovery", "calibration", "samplers", "error-vs-time", "references",
-         "statistics", "spongecake", "endf", "rough-diffuse", "unseen", "wrong-stacks", "pulls", "structures",
+         "statistics", "spongecake", "endf", "rough-diffuse", "held-out", "wrong-stacks", "pulls", "structures",
          "accelerator", "side-by-side")  # fmt: skip
 
-POSTERIORS = ("haze", "errors", "banana", "degenerate", "bounded")
+POSTERIORS = ("haze", "discrepancy", "banana", "degenerate", "bounded")
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Run a benchmark, print its tables, and write them with all figures into a directory."""
     parser = _parser()
-    given = parser.parse_args(arguments)
+    parsed = parser.parse_args(arguments)
 
     # before numpy is loaded: two threads on a 2,000 x 6 matrix only get into each other's way, and scipy pays for it
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -45,10 +45,10 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"[{time.perf_counter() - began:5.0f} s] {line}", file=sys.stderr, flush=True)
 
     try:
-        options = _options(given)
+        options = _options(parsed)
     except ValueError as error:
         parser.error(str(error))
-    study = importlib.import_module(f"benchmarks.studies.{given.benchmark.replace('-', '_')}").study
+    study = importlib.import_module(f"benchmarks.studies.{parsed.benchmark.replace('-', '_')}").study
     text, paths = study(report=report, **options)
     print(text)
     report(f"written: {', '.join(map(str, paths))}")
@@ -90,7 +90,7 @@ def _parser() -> argparse.ArgumentParser:
         compared,
         calibrated,
         commands.choices["samplers"],
-        commands.choices["unseen"],
+        commands.choices["held-out"],
         commands.choices["wrong-stacks"],
         commands.choices["structures"],
     ):
@@ -100,30 +100,30 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _options(given: argparse.Namespace) -> dict[str, Any]:
-    """What a study is called with, by what was given on the command line; ValueError names a model that is none."""
-    options: dict[str, Any] = {"quick": given.quick}
-    if given.out is not None:
-        options["directory"] = given.out
-    if given.benchmark in ("throughput", "textured", "maps", "references"):
-        options["with_peers"] = not given.no_peers
-    if given.benchmark == "spongecake":
-        options["work"] = given.work
-    if given.benchmark in ("error-vs-time", "calibration", "samplers", "unseen", "wrong-stacks", "structures"):
-        options["resume"] = given.resume
-    if given.benchmark == "error-vs-time":
+def _options(parsed: argparse.Namespace) -> dict[str, Any]:
+    """Arguments of a study, from those of the command line; ValueError names an unknown family, stack or model."""
+    options: dict[str, Any] = {"quick": parsed.quick}
+    if parsed.out is not None:
+        options["directory"] = parsed.out
+    if parsed.benchmark in ("throughput", "textured", "maps", "references"):
+        options["with_peers"] = not parsed.no_peers
+    if parsed.benchmark == "spongecake":
+        options["work"] = parsed.work
+    if parsed.benchmark in ("error-vs-time", "calibration", "samplers", "held-out", "wrong-stacks", "structures"):
+        options["resume"] = parsed.resume
+    if parsed.benchmark == "error-vs-time":
         from benchmarks.studies.error_vs_time.models import named
         from benchmarks.suite.cases import load
 
-        load(given.families, given.stacks)  # names that are none are told here
-        options |= {name: getattr(given, name) for name in ("families", "stacks", "truths")}
-        options["models"] = named(given.models)
-    if given.benchmark == "calibration":
+        load(parsed.families, parsed.stacks)  # raises for unknown names
+        options |= {name: getattr(parsed, name) for name in ("families", "stacks", "truths")}
+        options["models"] = named(parsed.models)
+    if parsed.benchmark == "calibration":
         from layerjax import AddingDoubling
 
-        options |= {"repeats": given.repeats, "posterior": given.posterior}
-        if given.resolution is not None:
-            nodes, modes = given.resolution
+        options |= {"repeats": parsed.repeats, "posterior": parsed.posterior}
+        if parsed.resolution is not None:
+            nodes, modes = parsed.resolution
             options["transport"] = AddingDoubling(nodes=nodes, modes=modes)
     return options
 

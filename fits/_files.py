@@ -8,7 +8,6 @@ import tempfile
 import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
-from io import RawIOBase
 from pathlib import Path
 from typing import Any
 
@@ -136,14 +135,6 @@ def named(path: Path) -> Iterator[None]:
         yield
     except OSError as error:
         raise OSError(error.errno, error.strerror or str(error), str(path)) from None
-
-
-def write_whole(file: RawIOBase, content: bytes, path: Path) -> None:
-    """Write to an unbuffered file; an OSError names it, also if only a part of the content could be written."""
-    rest = memoryview(content)
-    with named(path):
-        while rest:  # after a partial write the rest fails with its reason
-            rest = rest[file.write(rest) :]
 
 
 @contextmanager

@@ -250,11 +250,6 @@ class Search:
         return tuple(name for name, score in others if score is not None and score.indistinguishable)
 
     @property
-    def ranking(self) -> tuple[str, ...]:
-        """Names of all stacks, best first."""
-        return tuple(one.name for one in self.candidates)
-
-    @property
     def probabilities(self) -> dict[str, float]:
         """Model probabilities by name, among the cross-validated stacks, all as probable beforehand."""
         return {one.name: one.model_score.model_probability for one in self.candidates if one.model_score is not None}

@@ -38,10 +38,14 @@ def require_seed(seed: object) -> None:
     require_count("seed", seed, 0, 2**32 - 1)
 
 
-def require_number(name: str, value: object, low: float = -math.inf, high: float = math.inf) -> None:
-    """Refuse what is not a real number in a closed range."""
-    if isinstance(value, bool) or not (isinstance(value, Real) and low <= float(value) <= high):
-        raise ValueError(f"{name} is {in_short(value)}; it must be a number from {low:g} to {high:g}")
+def require_number(
+    name: str, value: object, low: float = -math.inf, high: float = math.inf, *, open_ends: bool = False
+) -> None:
+    """Refuse what is not a real number in a range, which is closed, or open at both ends."""
+    number: Any = value if isinstance(value, Real) and not isinstance(value, bool) else math.nan
+    if not (low < number < high if open_ends else low <= number <= high):
+        left, right = "()" if open_ends else "[]"
+        raise ValueError(f"{name} is {in_short(value)}; it must be a number in {left}{low:g}, {high:g}{right}")
 
 
 def require_choice(name: str, value: object, allowed: Iterable[Any]) -> None:

@@ -53,7 +53,7 @@ def test_stacks_of_the_gallery_are_those_that_are_printed():
     ("text", "expected"),
     [
         ("see [errata](errata.md#a).", "see [errata](errata.md#a)."),
-        ("[all](../benchmarks/results/unseen.md)", "[all](benchmarks/unseen.md)"),
+        ("[all](../benchmarks/results/held-out.md)", "[all](benchmarks/held-out.md)"),
         ("[new](../CHANGELOG.md#x)", "[new](project/changelog.md#x)"),
         ("the [suite](../benchmarks/suite)", "the suite"),
         (

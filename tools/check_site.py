@@ -17,7 +17,7 @@ LOADED = {"script": "src", "img": "src", "link": "href", "iframe": "src", "sourc
 """What a browser fetches by itself: tags, and the attribute that says from where."""
 
 NOT_FETCHED = {"canonical", "next", "prev", "index", "search", "author", "copyright"}
-"""Of links in the head, those that say where the page stands."""
+"""Links in the head that state where the page is in the site."""
 
 
 class Page(HTMLParser):

@@ -26,7 +26,7 @@ SHORT = (
     "tests/fits/problem",
 )
 RUNNERS = ("pytest", "pytest-xdist", "hypothesis")
-"""Of the extra "test", what running tests needs."""
+"""Packages of the extra "test" that running tests needs."""
 
 BOUNDS = ("lowest", "newest")
 

@@ -5,7 +5,7 @@
 A word is in the tables if it can hardly be right, alone or with its neighbours. Words that also have a plain or a
 technical sense are not: `read`, a gerund as in "reading a file", `share` of energy, `alone` and `again` as adverbs,
 `shape` and `behind` in space, `size`, `nodes`, `table`, `score`. Local names are checked by `NAMES` only, and `of` as a
-parameter only, as it is a constructor in `Totals.of`.
+parameter only, as it is a constructor in `Totals.of`. This file, which has all of these words, is skipped.
 """
 
 import ast
@@ -124,7 +124,7 @@ def main(folders: list[str]) -> None:
     count: Counter[str] = Counter()
     for folder in map(Path, folders):
         files = [path for kind in ("*.py", "*.md") for path in folder.rglob(kind)] if folder.is_dir() else [folder]
-        for path in sorted(files):
+        for path in sorted(path for path in files if path.resolve() != Path(__file__).resolve()):
             for line, word, better in sorted(set(on_page(path) if path.suffix == ".md" else findings(path))):
                 print(f"{path}:{line}: {word} -> {better}")
                 count["/".join(path.parts[:2])] += 1

@@ -104,11 +104,11 @@ def defaults() -> dict[str, Any]:
     return {name: list(value.asTuple()) if hasattr(value, "asTuple") else value for name, value in values.items()}
 
 
-def run(given: dict[str, Any], browser: str) -> Any:
-    """What the page makes of it: radiance under a light of 1, (cases, pairs, 3)."""
+def run(inputs: dict[str, Any], browser: str) -> Any:
+    """Values that the page computes: radiance under a light of 1, (cases, pairs, 3)."""
     with tempfile.TemporaryDirectory() as folder:
         page = Path(folder) / "page.html"
-        page.write_text(PAGE.read_text().replace("GIVEN", json.dumps(given).replace("</", "<\\/")))
+        page.write_text(PAGE.read_text().replace("GIVEN", json.dumps(inputs).replace("</", "<\\/")))
         words = [browser, "--headless", "--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader"]
         words += ["--enable-unsafe-swiftshader", "--virtual-time-budget=600000", "--dump-dom", page.as_uri()]
         shown = subprocess.run(words, capture_output=True, text=True, timeout=500, check=True).stdout

@@ -120,9 +120,9 @@ class Citation(NamedTuple):
 
 def page() -> str:
     """The text of docs/papers.md."""
-    found: dict[Paper, dict[str, dict[str, Path]]] = defaultdict(lambda: defaultdict(dict))
+    citations_of: dict[Paper, dict[str, dict[str, Path]]] = defaultdict(lambda: defaultdict(dict))
     for citation in citations():
-        found[citation.paper][citation.label].setdefault(citation.place, citation.path)
+        citations_of[citation.paper][citation.label].setdefault(citation.place, citation.path)
     lines = [
         "# Papers to functions",
         "",
@@ -130,11 +130,11 @@ def page() -> str:
         "`python -m tools.papers`; what is put right on the way is in [errata.md](errata.md).",
     ]
     for paper in PAPERS:
-        if paper not in found:
+        if paper not in citations_of:
             continue
         lines += ["", f"## {paper.reference}", "", paper.note, "", "| in the paper | in the source |", "|---|---|"]
-        for label in sorted(found[paper], key=_order):
-            links = (f"[`{name}`](../{path.as_posix()})" for name, path in sorted(found[paper][label].items()))
+        for label in sorted(citations_of[paper], key=_order):
+            links = (f"[`{name}`](../{path.as_posix()})" for name, path in sorted(citations_of[paper][label].items()))
             lines.append(f"| {label} | {'<br>'.join(links)} |")
     return "\n".join(lines) + "\n"
 

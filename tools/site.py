@@ -37,7 +37,7 @@ BARS = re.compile(r"\|(\S(?:[^|]*\S)?)\|")
 FENCE = re.compile(r"(^ *```.*?^ *```)", re.DOTALL | re.MULTILINE)
 
 SCHEME = {"url": "{{path}}#{{fragment}}"}
-"""Of links to source pages, which are no documents of Sphinx."""
+"""URL scheme of links to source pages, which are no documents of Sphinx."""
 
 
 def setup(app: Sphinx) -> dict[str, bool]:

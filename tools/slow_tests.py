@@ -52,23 +52,23 @@ def write(table: dict[str, Row], path: Path = TABLE) -> None:
 def turns(tests: Iterable[str], table: dict[str, Row], room: float) -> list[list[str]]:
     """Neighbours stay together, as far as they fit: they share programs."""
     dealt: list[list[str]] = []
-    alone: list[list[str]] = []
+    long: list[list[str]] = []
     filled = room
     for test in tests:
         seconds = table.get(test, Row()).seconds
         if seconds > room / WORKERS:
-            alone.append([test])
+            long.append([test])
             continue
         if filled + seconds > room:
             dealt.append([])
             filled = 0.0
         dealt[-1].append(test)
         filled += seconds
-    return dealt + alone
+    return dealt + long
 
 
 def commit_number() -> int:
-    """Of this commit: how many there are; where there is no history, that of the day."""
+    """Number of commits up to this one; without history, the number of the day."""
     try:
         count = subprocess.run(["git", "rev-list", "--count", "HEAD"], cwd=ROOT, capture_output=True, text=True)
         shallow = (ROOT / ".git" / "shallow").exists()

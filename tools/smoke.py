@@ -1,6 +1,6 @@
 """What an installed layerjax must do outside its source tree: python smoke.py SITE, SITE being where it is installed.
 
-Run by `python -m tools.check_wheel`. Tables that were not shipped, modules left out and a missing command show here.
+Run by `python -m tools.check_wheel`. Tables that were not shipped, missing modules and a missing command show here.
 """
 
 import inspect

@@ -9,7 +9,7 @@ FLOOR = 0.01
 """Share of the value of a Lambertian surface of the same albedo below which a value counts as that."""
 
 LEAST = 1e-12
-"""Albedo that stands for all smaller ones: what is less than that of the light is told apart by nobody."""
+"""Least albedo of the scale: a smaller share of the light counts as this."""
 
 Values = NDArray[np.float64]
 """BSDF values of pairs, (n, C)."""

@@ -1,4 +1,4 @@
-"""Readings through apertures by dense quadrature."""
+"""Measurements through apertures by dense quadrature."""
 
 import numpy as np
 
@@ -29,7 +29,7 @@ def mean_over_cones(
     detector: float,
     transport: lj.Transport = SINGLE,
 ) -> np.ndarray:
-    """Readings (N, C), each by hundreds of pairs of directions and more."""
+    """BSDF averaged over both apertures, (N, C), each value by hundreds of pairs of directions or more."""
     found, count = [], 6 if source and detector else 12
     for i, o in zip(wi, wo, strict=True):
         (lights, a), (views, b) = (

@@ -12,7 +12,7 @@ PACKAGES = ("jax", "jaxlib", "equinox", "numpy", "scipy", "optimistix", "emcee",
 
 def describe() -> dict[str, str | int]:
     """Processor, cores, load and versions (only of what is installed). No date: a rerun changes what differs."""
-    found: dict[str, str | int] = {
+    description: dict[str, str | int] = {
         "processor": _processor(),
         "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1,
         "load average at the start": f"{os.getloadavg()[0]:.1f}",
@@ -22,10 +22,10 @@ def describe() -> dict[str, str | int]:
     }
     for package in PACKAGES:
         try:
-            found[package] = version(package)
+            description[package] = version(package)
         except PackageNotFoundError:
             continue
-    return found
+    return description
 
 
 def _processor() -> str:

@@ -14,13 +14,13 @@ MOST_PIECES = 20_000
 
 
 def resident() -> int:
-    """Bytes of this process in memory; 0 where the system does not tell."""
+    """Bytes of this process in memory; 0 where the system does not report it."""
     statm = Path("/proc/self/statm")
     return int(statm.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") if statm.exists() else 0
 
 
 def pieces() -> int:
-    """Mapped pieces of memory of this process; 0 where the system does not tell."""
+    """Mapped pieces of memory of this process; 0 where the system does not report it."""
     maps = Path("/proc/self/maps")
     return maps.read_bytes().count(b"\n") if maps.exists() else 0
 

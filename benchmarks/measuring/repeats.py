@@ -33,15 +33,15 @@ def fit_many(problem: Problem, values: ArrayLike, *, starts: int = 1, seed: int 
     """Fit K data sets (K, N, C) in the place of the problem's used values, in one compiled program.
 
     Args:
-        problem: gives the stack, the directions and the noise. A resolution that its transport leaves open is that of
-            the start values; the problem of a `Fit` has the one that the noise asks for.
+        problem: gives the stack, the directions and the noise. A transport without a resolution of its own takes that
+            of the start values; the problem of a `Fit` has the one that the noise requires.
         values: BSDF in 1/sr, (K, N, C).
-        starts: of each fit; the lowest end is kept, converged or not.
-        seed: of the starts.
+        starts: of each fit; the lowest minimum is returned, converged or not.
+        seed: random seed of the starts.
 
     Returns:
         Vectors and standard errors (K, P), costs and convergence (K,). The errors are those of the unbounded optimum:
-        they mean nothing for parameters that end on a bound.
+        they mean nothing for parameters at a bound.
 
     Raises:
         ValueError: values of another shape.
@@ -63,13 +63,13 @@ def _solve_repeats(model: Model, starts: Array, values: Array) -> tuple[Array, A
     def one(row: Array) -> tuple[Array, Array, Array, Array]:
         repeat = eqx.tree_at(lambda m: m.values, model, row)
         most, tolerance = jnp.asarray(MOST_STEPS), jnp.asarray(COST_TOLERANCE)
-        ends = jax.lax.map(lambda start: descend(repeat, start, jnp.asarray(True), most, tolerance), starts)
-        end = jax.tree.map(lambda part: part[jnp.argmin(ends.cost)], ends)
-        width = model.box.slope(end.vector)
+        outcomes = jax.lax.map(lambda start: descend(repeat, start, jnp.asarray(True), most, tolerance), starts)
+        best = jax.tree.map(lambda part: part[jnp.argmin(outcomes.cost)], outcomes)
+        width = model.box.slope(best.vector)
         slopes = model.box.prior_slopes()
-        covariance = jnp.linalg.pinv(end.root.T @ end.root + slopes.T @ slopes, hermitian=True)
+        covariance = jnp.linalg.pinv(best.root.T @ best.root + slopes.T @ slopes, hermitian=True)
         if model.objective != "likelihood":
-            covariance = covariance * 2.0 * end.cost / max(row.size - width.size, 1)
-        return end.vector, jnp.sqrt(jnp.diagonal(covariance)) * width, end.cost, end.converged
+            covariance = covariance * 2.0 * best.cost / max(row.size - width.size, 1)
+        return best.vector, jnp.sqrt(jnp.diagonal(covariance)) * width, best.cost, best.converged
 
     return jax.lax.map(one, values)

@@ -1,4 +1,4 @@
-"""Wall times by interleaved repeats: every round runs each way once, so that a busy machine slows all of them alike."""
+"""Wall times by interleaved repeats: every round runs each way once, so that a busy machine slows all equally."""
 
 import time
 from collections.abc import Callable, Mapping
@@ -11,7 +11,7 @@ Work = Callable[[], object]
 Result = TypeVar("Result")
 
 LONG = 1.0
-"""Seconds after which work is not repeated by `first_and_again`."""
+"""Seconds after which work is not repeated by `cold_and_warm`."""
 
 
 def interleaved(ways: Mapping[str, Work], rounds: int) -> dict[str, np.ndarray]:
@@ -36,21 +36,21 @@ def once(work: Work) -> float:
     return time.perf_counter() - began
 
 
-def first_and_again(work: Callable[[], Result], rounds: int) -> tuple[Result, float, float]:
-    """What the work gives, seconds of its first run, and the median of later ones (one, if it takes `LONG`)."""
-    found: list[Result] = []
-    first = once(lambda: found.append(work()))
-    again = [once(work)]
-    while len(again) < rounds and sum(again) < LONG:
-        again.append(once(work))
-    return found[0], first, float(np.median(again))
+def cold_and_warm(work: Callable[[], Result], rounds: int) -> tuple[Result, float, float]:
+    """The result of the work, seconds of its first run, and the median of later ones (one, if it takes `LONG`)."""
+    results: list[Result] = []
+    cold = once(lambda: results.append(work()))
+    warm = [once(work)]
+    while len(warm) < rounds and sum(warm) < LONG:
+        warm.append(once(work))
+    return results[0], cold, float(np.median(warm))
 
 
 def compiled(function: Callable[..., Any], arguments: tuple[Any, ...]) -> tuple[Any, float]:
     """The program of a function for arguments like these, and the seconds that it takes to trace and compile."""
-    found: list[Any] = []
-    seconds = once(lambda: found.append(jax.jit(function).lower(*arguments).compile()))
-    return found[0], seconds
+    programs: list[Any] = []
+    seconds = once(lambda: programs.append(jax.jit(function).lower(*arguments).compile()))
+    return programs[0], seconds
 
 
 def waiting(program: Callable[..., Any], arguments: tuple[Any, ...]) -> Callable[[], Any]:

@@ -20,7 +20,7 @@ NOT_REACHED = "**error not reached**"
 
 @dataclass(frozen=True)
 class Bar:
-    """The ratio to a peer that is asked for at least, and the one aimed at.
+    """The required ratio to a peer, and the one aimed at.
 
     For times (ours / theirs) smaller is better, for rates (ours / theirs, `rate`) larger.
     """
@@ -35,7 +35,7 @@ class Bar:
         return "aim met" if reached[1] else "met" if reached[0] else "**not met**"
 
     def words(self) -> str:
-        """The bar as it stands in the table: what is asked for and, in brackets, what is aimed at."""
+        """The bar as it stands in the table: what is required and, in brackets, what is aimed at."""
         sign = ">=" if self.rate else "<="
         return f"{sign} {self.least:g} ({self.aim:g})"
 

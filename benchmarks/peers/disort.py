@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 Values = NDArray[np.float64]
 
 ROUNDING = 1e-15
-"""Legendre coefficients of the phase function below this are left out."""
+"""Legendre coefficients of the phase function below this are omitted."""
 
 
 def why_not() -> str | None:
@@ -55,7 +55,7 @@ def bsdf(
         cosines: of the viewer, above 0 for reflection and below for transmission; None: the solver's `nodes`.
         corrected: delta-M scaling, and the corrections of Nakajima & Tanaka (1988) for it.
         modes: Fourier modes in azimuth; None: as many as streams.
-        reflection_only: leave out the transmission; `cosines` are then above 0 (None: the upper half of the nodes).
+        reflection_only: omit the transmission; `cosines` are then above 0 (None: the upper half of the nodes).
         base: albedo of a Lambertian base under the slab; 0 for none.
     """
     from PythonicDISORT.subroutines import interpolate

@@ -16,7 +16,7 @@ Array = NDArray[np.float64]
 Reflectance = Callable[[Array], Array]
 
 WINDOW = 0.5
-"""Percent of the paths that the bins of a lobe leave out at each end, in x and in y."""
+"""Percent of the paths beyond the bins of a lobe at each end, in x and in y."""
 
 
 @dataclass(frozen=True)
@@ -136,7 +136,7 @@ def coat(
 
 
 def slab(ior: float, top: float, bottom: float, angle: float, paths: int, *, seed: int = 0) -> Walked:
-    """Light at `angle` degrees through a slab with two rough sides, straight: what leaves below."""
+    """Light at `angle` degrees that a slab with two rough sides transmits without a reflection inside it."""
     random = np.random.default_rng(seed)
     inner, entered, _, _ = _Surface(top, True).meet(random, _starting(angle, paths), ior)
     left, passed, _, _ = _Surface(bottom, True).meet(random, _across(inner), 1.0 / ior)

@@ -67,7 +67,7 @@ class Volpath:
         return _estimate(sums / self.cosine ** np.array([1, 2])[:, None, None], rounds * share)
 
     def energies(self, paths: int, seed: int = 0) -> tuple[tuple[Values, Values], tuple[Values, Values]]:
-        """Albedo to the light's own side and to the other, each (C,) with its standard error: viewers at random."""
+        """Reflected and transmitted albedo, each (C,) with its standard error, by random outgoing directions."""
         random = np.random.default_rng(seed)
         found = []
         for side in (self.side, -self.side):

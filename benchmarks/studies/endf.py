@@ -21,8 +21,8 @@ PATHS, QUICK_PATHS = 1_000_000, 100_000
 PAPER, RECIPROCAL = lj.ENDF(form="paper"), lj.ENDF()
 FORMS: tuple[Form, ...] = ("paper", "reciprocal")
 
-STRAIGHT_THROUGH, ONE_BOUNCE = 1, 2
-"""Events less one: in and out; in, off the base, and out. Every further bounce has two more."""
+DIRECT, ONE_BOUNCE = 1, 2
+"""Events less one of direct transmission (in and out), and of one bounce (in, off the base, out); two more a bounce."""
 
 MOST_BOUNCES = 4
 
@@ -50,7 +50,7 @@ TEXT = """\
 {environment}
 `ENDF(form="paper")`, the corrected paper, and `ENDF(form="reciprocal")` beside {paths:,} paths through von Mises-Fisher
 facets (`benchmarks/peers/endf_walk.py`: plain numpy, Fresnel at every facet, separable masking). *RandomWalk* is the
-energy of the same paths, told apart by their number of events, among as many of the library's own walk
+energy of the same paths, selected by their number of events from as many of the library's own walk
 (`lj.goniophotometer`).
 *Distance* is the sum of |model - truth| over 41 by 41 cells of the projected lobe by the sum of the truth; *floor* is
 what the noise of the truth alone makes of it. Angles in degrees; kappa = 2 / alpha^2, of the coat and of the base.
@@ -61,7 +61,7 @@ Standard errors of energies are below {error:.1g}.
 The last two are Fig. 17 of the paper; kappa 10 over 1e6 is the horse of Fig. 16 without absorption.
 
 {coats}
-## Straight through a slab of index 1.5
+## Direct transmission through a slab of index 1.5
 
 {slabs}
 ## Figs. 6 and 7: concentration of a beam after rough reflection and refraction at index 1.5
@@ -93,7 +93,7 @@ def study(
 ) -> tuple[str, Sequence[Path]]:
     """Measure, and write ``endf.md`` and ``endf.json``. quick: fewer paths."""
     paths = QUICK_PATHS if quick else PATHS
-    found: dict[str, list[dict[str, Any]]] = {}
+    results: dict[str, list[dict[str, Any]]] = {}
     for name, measure in (
         ("coats", _coats),
         ("slabs", _slabs),
@@ -102,12 +102,12 @@ def study(
         ("tinted", _tinted),
     ):
         report(name)
-        found[name] = measure(paths)
+        results[name] = measure(paths)
     around = environment.describe()
-    error = max(row["error"] for name in ("coats", "slabs", "bounces", "tinted") for row in found[name])
-    tables = {name: _table(rows) for name, rows in found.items()}
+    error = max(row["error"] for name in ("coats", "slabs", "bounces", "tinted") for row in results[name])
+    tables = {name: _table(rows) for name, rows in results.items()}
     text = TEXT.format(environment=environment_lines(around), paths=paths, error=error, depth=DEPTH, **tables)
-    content = {"environment": around, "paths": paths, **found}
+    content = {"environment": around, "paths": paths, **results}
     return text, write("endf", content, text, directory)
 
 
@@ -151,7 +151,7 @@ def _compared(truth: endf_truth.Walked, stack: lj.Stack, angle: float, bare: Any
             distances[form] = lobe.distance(_difference(both, bare))
     energy, error = truth.energy
     reflected, transmitted = _walked(stack, angle, paths)
-    walk, noise = transmitted[STRAIGHT_THROUGH] if bare is None else reflected[ONE_BOUNCE]
+    walk, noise = transmitted[DIRECT] if bare is None else reflected[ONE_BOUNCE]
     return {
         "Monte Carlo": energy,
         "RandomWalk": walk,

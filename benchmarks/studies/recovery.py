@@ -35,19 +35,19 @@ TEXT = """\
 {environment}
 Flakes (SGGX: thickness, albedo, alpha) over a rough diffuse base (Oren-Nayar: albedo, roughness), five free parameters
 with wide uniform priors. In-plane slices at incidence {incidence} degrees, {samples} values, {noise:.0%} noise of the
-exact value; the fit is told the relative level and takes it of its own model. {starts} starts a fit.
+exact value; the fit knows the relative level and applies it to its own model. {starts} starts a fit.
 
 ## {repeats} fits
 
 *pull* is (fitted - true) / standard error: a mean of 0 +- {error:.2f} and a standard deviation of 1 +- {spread:.2f} are
-right. Asked for: within {within:g} standard errors in at least {enough:.0%} of the repeats. Converged: {converged}; a
+right. Required: within {within:g} standard errors in at least {enough:.0%} of the repeats. Converged: {converged}; a
 parameter ended on a bound in {bounded}. *many* are the same figures of {many:,} other repeats by `fit_many`, one start
 each.
 
 {fitted}
 ## {repeats} posteriors
 
-Central 68 % intervals: how many hold the truth. The expected count is {expected:.0f}; {low:.0f} to {high:.0f} is the
+Central 68 % intervals: how many cover the truth. The expected count is {expected:.0f}; {low:.0f} to {high:.0f} is the
 central 95 % of the binomial distribution. Converged chains: {chains}, {steps:.0f} steps in the median.
 
 {covered}"""
@@ -66,18 +66,18 @@ DEFAULT, QUICK = Size(100, 2000), Size(12, 100)
 
 @dataclass(frozen=True)
 class Row:
-    """One parameter over all repeats; `covered` counts posterior intervals, `within` fits."""
+    """One parameter over all repeats; `covered` counts posterior intervals, `within_3` fits."""
 
     parameter: str
     truth: float
     typical_error: float
-    pull_mean: float
-    pull_sd: float
-    within: int
+    mean_of_pulls: float
+    sd_of_pulls: float
+    within_3: int
     recovered: bool
-    many_pull_mean: float
-    many_pull_sd: float
-    many_within: float
+    many_mean_of_pulls: float
+    many_sd_of_pulls: float
+    many_within_3: float
     covered: int
     coverage_holds: bool
     posterior_sd_over_error: float
@@ -218,13 +218,13 @@ def _rows(results: list[tuple[fits.Fit, fits.Posterior]], many: Repeats, size: S
             parameter=name,
             truth=float(truth[i]),
             typical_error=float(np.nanmedian(errors[:, i])),
-            pull_mean=float(np.nanmean(pulls[:, i])),
-            pull_sd=float(np.nanstd(pulls[:, i], ddof=1)),
-            within=int(within[i]),
+            mean_of_pulls=float(np.nanmean(pulls[:, i])),
+            sd_of_pulls=float(np.nanstd(pulls[:, i], ddof=1)),
+            within_3=int(within[i]),
             recovered=bool(within[i] >= ENOUGH * size.repeats),
-            many_pull_mean=float(np.mean(many_pulls[:, i])),
-            many_pull_sd=float(np.std(many_pulls[:, i], ddof=1)),
-            many_within=float(np.sum(np.abs(many_pulls[:, i]) <= WITHIN) / size.many),
+            many_mean_of_pulls=float(np.mean(many_pulls[:, i])),
+            many_sd_of_pulls=float(np.std(many_pulls[:, i], ddof=1)),
+            many_within_3=float(np.sum(np.abs(many_pulls[:, i]) <= WITHIN) / size.many),
             covered=int(covered[i]),
             coverage_holds=bool(low <= covered[i] <= high),
             posterior_sd_over_error=float(np.nanmedian(ratio[:, i])),
@@ -241,13 +241,13 @@ def _fitted_table(rows: list[Row]) -> str:
             row.parameter,
             figure(row.truth),
             figure(row.typical_error, 2),
-            f"{row.pull_mean:+.2f}",
-            f"{row.pull_sd:.2f}",
-            str(row.within),
+            f"{row.mean_of_pulls:+.2f}",
+            f"{row.sd_of_pulls:.2f}",
+            str(row.within_3),
             "met" if row.recovered else "**not met**",
-            f"{row.many_pull_mean:+.3f}",
-            f"{row.many_pull_sd:.3f}",
-            f"{row.many_within:.2%}",
+            f"{row.many_mean_of_pulls:+.3f}",
+            f"{row.many_sd_of_pulls:.3f}",
+            f"{row.many_within_3:.2%}",
         )
         for row in rows
     ]
@@ -255,7 +255,7 @@ def _fitted_table(rows: list[Row]) -> str:
 
 
 def _covered_table(rows: list[Row]) -> str:
-    header = ("parameter", "68 % intervals that hold the truth", "verdict", "posterior sd / standard error")
+    header = ("parameter", "68 % intervals that cover the truth", "verdict", "posterior sd / standard error")
     body = [
         (
             row.parameter,

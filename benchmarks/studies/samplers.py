@@ -20,8 +20,8 @@ NAME = "samplers"
 TRANSPORT = lj.AddingDoubling(nodes=6, modes=6)
 NOISE, FLOOR = 0.05, 1e-6
 ESS, QUICK, STEPS = 6000.0, 1000.0, 100_000
-LEAST, APART = 5000.0, 0.1
-"""Effective sample size of the worst parameter, and deviations that quantiles may differ by."""
+LEAST, MOST_DIFFERENCE = 5000.0, 0.1
+"""Effective sample size of the worst parameter, and standard deviations by which quantiles may differ."""
 QUANTILES = (0.158655, 0.5, 0.841345)
 
 PLAIN = "emcee"
@@ -31,7 +31,8 @@ SAMPLERS: dict[str, dict[str, Any]] = {
     "NUTS": {"sampler": "nuts"},
 }
 
-HEADER = ("posterior", "sampler", "ESS", "steps", "walkers", "taken", "lost", "seconds", "ESS/s", "apart", "verdict")
+HEADER = ("posterior", "sampler", "ESS", "steps", "walkers", "accepted", "divergences", "seconds", "ESS/s",
+          "difference", "verdict")  # fmt: skip
 
 TEXT = """\
 # Do samplers agree, and which is fast?
@@ -40,9 +41,9 @@ TEXT = """\
 The first three posteriors are of a rough interface over haze over a diffuse base, all orders of scattering, by
 `{transport}`: 140 measurements in the plane of incidence, simulated with noise of {noise:.0%}; the others are those
 of [calibration](calibration.md). Each is sampled until every parameter has an effective sample size (ESS)
-of {ess:,.0f}. *taken* is the share of proposals that were, *lost* the divergences of NUTS after its warm-up; *apart*
-is the largest difference of a quantile (16, 50 and 84 %) of any parameter from that of emcee, in standard deviations
-of the parameter. Samplers agree where it is below {apart:g} with {least:,.0f} effective samples or more.
+of {ess:,.0f}. *accepted* is the share of accepted proposals, *divergences* are those of NUTS after its warm-up;
+*difference* is the largest of a quantile (16, 50 and 84 %) of any parameter from that of emcee, in standard deviations
+of the parameter. Samplers agree where it is below {most:g} with {least:,.0f} effective samples or more.
 
 {posteriors}
 {rows}"""
@@ -69,14 +70,14 @@ class Sampled:
 
 def _fitted(free: dict[str, Any], relative: float | fits.Free = NOISE, transport: lj.Transport = TRANSPORT) -> fits.Fit:
     """The fit of some parameters of the coated haze; the others are known. relative: the level of its noise."""
-    data = fits.simulate(coated_haze.stack_of(), coated_haze.readings(), transport, NOISE, FLOOR, seed=1)
+    data = fits.simulate(coated_haze.stack_of(), coated_haze.goniometer_slices(), transport, NOISE, FLOOR, seed=1)
     stack = coated_haze.stack_of(coated_haze.PARAMETERS | free)
     noise = fits.Noise(relative=relative, floor=FLOOR, use_sigma=False)
     return fits.fit(stack, data, transport=transport, noise=noise, starts=4, seed=0)
 
 
 def five_parameters() -> fits.Fit:
-    """Thickness and asymmetry go together, and the albedo alone is known"""
+    """Thickness and asymmetry are strongly correlated; the albedo is fixed"""
     return _fitted({name: free for name, free in coated_haze.FREE.items() if name != "albedo"})
 
 
@@ -103,7 +104,7 @@ def degenerate() -> fits.Fit:
 
 
 def bounded() -> fits.Fit:
-    """Roughness and albedo lean on their bounds"""
+    """Roughness and albedo reach their bounds"""
     return fitted_case("bounded")
 
 
@@ -131,7 +132,7 @@ def study(
         quick: 1,000 effective samples: a look, no result to quote.
         resume: keep what the directory holds, and sample what it lacks. Each chain is written as it ends.
         posteriors: fits by name, made where they are needed.
-        ess: effective samples that are asked for; 6,000 if None.
+        ess: required effective samples; 6,000 if None.
 
     Raises:
         ValueError: samples to resume that were drawn with other settings.
@@ -140,7 +141,7 @@ def study(
     settings = rounded(
         {"transport": repr(TRANSPORT), "noise": NOISE, "ess": wanted, "parameters": coated_haze.PARAMETERS}
     )
-    done = _held(directory, settings, posteriors) if resume else []
+    done = _stored(directory, settings, posteriors) if resume else []
     surroundings = environment.describe()
     text, paths = "", (Path(), Path())
     for name, made in posteriors.items():
@@ -158,13 +159,13 @@ def study(
 def _sampled(name: str, sampler: str, fit: fits.Fit, ess: float) -> Sampled:
     began = time.perf_counter()
     posterior = fits.sample(fit, seed=1, ess=ess, max_steps=STEPS, allow_unconverged=True, **SAMPLERS[sampler])
-    kept = posterior.chain[posterior.burn_in :].reshape(-1, len(posterior.names))
+    draws = posterior.chain[posterior.burn_in :].reshape(-1, len(posterior.names))
     return Sampled(
         posterior=name,
         sampler=sampler,
         parameters=list(posterior.names),
-        quantiles=np.quantile(kept, QUANTILES, axis=0).tolist(),
-        deviations=kept.std(axis=0).tolist(),
+        quantiles=np.quantile(draws, QUANTILES, axis=0).tolist(),
+        deviations=draws.std(axis=0).tolist(),
         effective=float(posterior.effective_samples.min()),
         steps=posterior.chain.shape[0],
         walkers=posterior.chain.shape[1],
@@ -176,12 +177,12 @@ def _sampled(name: str, sampler: str, fit: fits.Fit, ess: float) -> Sampled:
     )
 
 
-def apart(one: Sampled, plain: Sampled) -> float:
+def quantile_difference(one: Sampled, plain: Sampled) -> float:
     """The largest difference of a quantile, in standard deviations of `plain`."""
     return float(np.max(np.abs(np.subtract(one.quantiles, plain.quantiles)) / np.array(plain.deviations)))
 
 
-def _held(directory: Path, settings: Mapping[str, Any], posteriors: Container[str]) -> list[Sampled]:
+def _stored(directory: Path, settings: Mapping[str, Any], posteriors: Container[str]) -> list[Sampled]:
     """What the directory holds of these posteriors; ValueError if it was sampled with other settings."""
     path = directory / f"{NAME}.json"
     if not path.exists():
@@ -208,7 +209,7 @@ def _save(
         transport=settings["transport"],
         noise=NOISE,
         ess=settings["ess"],
-        apart=APART,
+        most=MOST_DIFFERENCE,
         least=LEAST,
         posteriors="".join(f"- *{name}*: {(made.__doc__ or '').strip()}.\n" for name, made in posteriors.items()),
         rows=table(
@@ -227,10 +228,10 @@ def _save(
 def _row(one: Sampled, plain: Sampled | None) -> tuple[str, ...]:
     difference, verdict = "-", "-"
     if plain is not None and plain is not one:
-        value = apart(one, plain)
+        value = quantile_difference(one, plain)
         long_enough = min(one.effective, plain.effective) >= LEAST
         difference = figure(value, 2)
-        verdict = "too short" if not long_enough else "agree" if value < APART else "**differ**"
+        verdict = "too short" if not long_enough else "agree" if value < MOST_DIFFERENCE else "**differ**"
     return (
         one.posterior,
         one.sampler,

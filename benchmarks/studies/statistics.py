@@ -63,8 +63,8 @@ of the model.
 {energies}
 Over {count} two-layer cases (coats 1.5/.01, 1.5/.1, 1.5/.3 and 2/.1 on 1+1i and .2+3.9i of .01, .1, .3 and .5, at the
 four angles, {few:,} paths each) errors of the light from below have a root mean square of {deep:.1f} %, and of
-{own:.1f} % with `own_side=True`, light from inside meeting the reflectance of its own side. Others have found 15.7 %
-and 12.9 % over as many cases, not the same.
+{own:.1f} % with `own_side=True`, which takes the reflectance of the interface from inside for light from inside. Others
+have found 15.7 % and 12.9 % over as many cases, not the same.
 """
 
 

@@ -25,7 +25,7 @@ TRANSPORT = lj.Statistical()
 NOISE = 0.02
 STARTS = 4
 FIRST, WANTED = 3, 36
-"""The true structure is asked to be among so many first in so many of all."""
+"""The true structure is required to be among so many first in so many of all."""
 
 WHOLE = default_library()
 FORWARD = lj.HenyeyGreenstein(fits.Free(0.3, 0.0, 0.9))
@@ -66,38 +66,38 @@ TEXT = """\
 # Structures that a search finds
 
 {environment}
-{repeats} materials of one to three layers with numbers drawn at random, read at 10, 30, 50 and 70 degrees of incidence
-with noise of {noise:.0%}. `fits.search` looks for the stack among those that an interface and haze over a diffuse base
-and a metal make, up to three layers. Data and fits are by `{transport}`, all orders of scattering by their moments:
-this judges the search, not how well a transport describes a material.
+{repeats} materials of one to three layers with numbers drawn at random, measured at 10, 30, 50 and 70 degrees of
+incidence with noise of {noise:.0%}. `fits.search` looks for the stack among those that an interface and haze
+over a diffuse base and a metal make, up to three layers. Data and fits are by `{transport}`, all orders of
+scattering by their moments: this judges the search, not how well a transport describes a material.
 
 {rows}
-*first*, *first three*: how often the true structure is ranked there. *told apart*: how often a wrong one is ahead of it
+*first*, *first three*: how often the true structure is ranked there. *beaten*: how often a wrong one has a higher elpd
 by more than chance (see `ModelScore.clear_diff`). *too complex*: how often such a one has more layers. *time*: of a
 search on one core.
 
-The true structure is among the first three in {found} of {repeats} (asked for: {wanted} of {asked}); a more complex one
-is preferred by more than chance in {complex}.
+The true structure is among the first three in {found} of {repeats} (required: {wanted} of {required}); a more complex
+one is preferred by more than chance in {complex}.
 """
 
 
 @dataclass(frozen=True)
 class Repeat:
-    """One material: its structure, the place of that in the result (0: the first; None: not looked at), the best one,
-    how far the true one is behind it, the same beyond chance, and how many structures were fitted."""
+    """One material: its structure, the place of that in the result (0: the first; None: not fitted), the best one,
+    the elpd difference of the true one from it, the same beyond chance, and how many structures were fitted."""
 
     repeat: int
     truth: str
     place: int | None
     best: str
-    behind: float | None
+    elpd_diff: float | None
     clear_diff: float | None
     fitted: int
     seconds: float
 
     @property
     def layers(self) -> int:
-        """Of the true stack."""
+        """Layers of the true stack."""
         return self.truth.count("/")
 
     @property
@@ -140,7 +140,7 @@ def _work(_: None, index: int) -> Repeat:
 
 
 def material(index: int) -> tuple[Structure, Measurements]:
-    """A structure, and readings of a stack with numbers that were drawn at random."""
+    """A structure, and measurements of a stack with numbers that are drawn at random."""
     structure = TRUTHS[index % len(TRUTHS)]
     generator = np.random.default_rng([2026, index])
 
@@ -155,7 +155,7 @@ def material(index: int) -> tuple[Structure, Measurements]:
     ]
     diffuse = structure[-1] == "diffuse"
     base = lj.Lambertian(number("albedo")) if diffuse else lj.Conductor(number("metal"), number("k"), number("alpha"))
-    data = fits.simulate(lj.Stack(layers, base), coated_haze.readings(), TRANSPORT, NOISE, 1e-6, seed=index)
+    data = fits.simulate(lj.Stack(layers, base), coated_haze.goniometer_slices(), TRANSPORT, NOISE, 1e-6, seed=index)
     return structure, Measurements(data.wi, data.wo, data.values, None, data.mask, data.channels, data.source)
 
 
@@ -167,14 +167,14 @@ def run_repeat(index: int) -> Repeat:
     options = fits.SearchOptions(layers=3, starts=STARTS)
     found = fits.search(data, LIBRARY, transport=TRANSPORT, noise=noise, seed=index, options=options)
     places = [place for place, one in enumerate(found.candidates) if one.structure == structure and one.model_score]
-    seen = found.candidates[places[0]].model_score if places else None
+    score = found.candidates[places[0]].model_score if places else None
     return Repeat(
         repeat=index,
         truth=named(structure),
         place=places[0] if places else None,
         best=found.best.name,
-        behind=None if seen is None else seen.elpd_diff,
-        clear_diff=None if seen is None else seen.clear_diff,
+        elpd_diff=None if score is None else score.elpd_diff,
+        clear_diff=None if score is None else score.clear_diff,
         fitted=len(found.candidates),
         seconds=time.perf_counter() - began,
     )
@@ -184,7 +184,7 @@ def _save(done: list[Repeat], directory: Path) -> tuple[str, tuple[Path, Path]]:
     surroundings = environment.describe()
     by_layers = {f"{count} layers": [one for one in done if one.layers == count] for count in (1, 2, 3)}
     rows = [_row(kind, found) for kind, found in (by_layers | {"all": done}).items() if found]
-    heads = ("true stack", "materials", "first", "first three", "told apart", "too complex", "fitted", "time")
+    heads = ("true stack", "materials", "first", "first three", "beaten", "too complex", "fitted", "time")
     text = TEXT.format(
         environment=environment_lines(surroundings),
         repeats=len(done),
@@ -193,7 +193,7 @@ def _save(done: list[Repeat], directory: Path) -> tuple[str, tuple[Path, Path]]:
         rows=table(heads, rows),
         found=sum(_among_first(one) for one in done),
         wanted=WANTED,
-        asked=REPEATS,
+        required=REPEATS,
         complex=sum(map(_too_complex, done)),
     )
     content = {"environment": surroundings, "repeats": [rounded(asdict(one)) for one in done]}
@@ -208,12 +208,12 @@ def _too_complex(one: Repeat) -> bool:
     return one.is_beaten and one.best.count("/") > one.layers
 
 
-def _row(kind: str, found: list[Repeat]) -> tuple[str, ...]:
+def _row(kind: str, repeats: list[Repeat]) -> tuple[str, ...]:
     counts = (
-        sum(one.place == 0 for one in found),
-        sum(map(_among_first, found)),
-        sum(one.is_beaten for one in found),
-        sum(map(_too_complex, found)),
+        sum(one.place == 0 for one in repeats),
+        sum(map(_among_first, repeats)),
+        sum(one.is_beaten for one in repeats),
+        sum(map(_too_complex, repeats)),
     )
-    fitted, seconds = (float(np.median([getattr(one, name) for one in found])) for name in ("fitted", "seconds"))
-    return kind, str(len(found)), *map(str, counts), f"{fitted:.0f}", f"{seconds:.0f} s"
+    fitted, seconds = (float(np.median([getattr(one, name) for one in repeats])) for name in ("fitted", "seconds"))
+    return kind, str(len(repeats)), *map(str, counts), f"{fitted:.0f}", f"{seconds:.0f} s"

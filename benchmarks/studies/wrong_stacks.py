@@ -1,4 +1,4 @@
-"""Bands of predictions by stacks that are wrong: of simulated materials, how many unseen readings they hold."""
+"""Predictions by wrong stacks: coverage of the intervals of held-out measurements of simulated materials."""
 
 import json
 import time
@@ -23,8 +23,9 @@ REPEATS, QUICK = 100, 10
 TRUTH = lj.AddingDoubling(nodes=12, modes=16)
 NOISE = 0.02
 STARTS = 4
-ASKED = "incidence=30,70"
-BAND = (0.90, 0.98)
+HELD_OUT = "incidence=30,70"
+COVERAGE = (0.90, 0.98)
+"""Required coverage of 95 % intervals."""
 
 MATERIALS = {
     "ior": fits.Free(1.5, 1.2, 2.0, fits.Normal(1.5, 0.1)),
@@ -41,32 +42,34 @@ WRONG = lj.Stack(
 )
 """What is fitted: it has no haze."""
 
-KINDS = {"noise alone": False, "shared errors": True}
+KINDS = {"independent noise": False, "model discrepancy": True}
 
 TEXT = """\
 # Predictions by wrong stacks
 
 {environment}
-{repeats} materials, each a rough interface over haze over a diffuse base with numbers drawn at random, read at 10, 30,
-50 and 70 degrees of incidence with noise of {noise:.0%} (all orders, `{truth}`). A stack without
-the haze is fitted to the readings at 10 and 50 degrees and foretells those at 30 and 70.
+{repeats} materials, each a rough interface over haze over a diffuse base with numbers drawn at random, measured at 10,
+30, 50 and 70 degrees of incidence with noise of {noise:.0%} (all orders, `{truth}`). A stack without
+the haze is fitted to the measurements at 10 and 50 degrees and predicts those held out, at 30 and 70: with independent
+noise only, and with model discrepancy as well.
 
 {rows}
-*in 95 %*, *in 50 %*: mean share of the unseen readings inside these bands, and its standard error over the materials;
-*error*: the median over materials of the median |prediction / reading - 1|; *score*: mean log-density of a reading.
-*chi2*: per degree of freedom, the median. Asked for: {low:.0%} to {high:.0%} in the band of 95 %.
+*in 95 %*, *in 50 %*: mean coverage of these intervals of held-out measurements, and its standard error over the
+materials; *error*: the median over materials of the median |prediction / measurement - 1|; *elpd*: mean log predictive
+density of a held-out measurement. *chi2*: reduced chi-square of the fit, the median. *verdict*: whether the coverage of
+the 95 % intervals is {low:.0%} to {high:.0%}.
 """
 
 
 @dataclass(frozen=True)
 class Repeat:
-    """One material, fitted by a wrong stack: scores of what it foretells."""
+    """One material, fitted by a wrong stack, and scores of its predictions; coverage in 95 % and 50 % intervals."""
 
     repeat: int
     kind: str
     reduced_chi_square: float
-    within_95: float
-    within_half: float
+    coverage_95: float
+    coverage_50: float
     error: float
     elpd: float
     amplitude: float | None
@@ -88,50 +91,48 @@ def study(
         repeats: how many there are to be in all; 100 if None.
     """
     wanted = repeats or (QUICK if quick else REPEATS)
-    done = _held(directory) if resume else []
+    done = _stored(directory) if resume else []
     simulator = jax.jit(lambda stack, wi, wo: lj.evaluate(stack, wi, wo, TRUTH))
     for index in range(len(done) // len(KINDS), wanted):
         data = material(index, simulator)
-        asked = select(data, ASKED)
-        done += [run_repeat(index, kind, data, asked) for kind in KINDS]
+        held_out = select(data, HELD_OUT)
+        done += [run_repeat(index, kind, data, held_out) for kind in KINDS]
         _save(done, directory)
-        report(
-            f"material {index + 1}/{wanted}: {done[-1].within_95:.2f} of the readings held, {done[-1].seconds:.1f} s"
-        )
+        report(f"material {index + 1}/{wanted}: coverage of 95 % {done[-1].coverage_95:.2f}, {done[-1].seconds:.1f} s")
     return _save(done, directory)
 
 
 def material(index: int, simulator: Callable[..., jax.Array]) -> Measurements:
-    """Readings of one that was drawn at random."""
+    """Measurements of a material that is drawn at random."""
     generator = np.random.default_rng([2020, index])
     truth = {name: drawn(free, generator) for name, free in MATERIALS.items()}
     stack = coated_haze.stack_of(coated_haze.PARAMETERS | truth)
-    data = fits.simulate(stack, coated_haze.readings(), simulator, NOISE, 1e-6, seed=index)
+    data = fits.simulate(stack, coated_haze.goniometer_slices(), simulator, NOISE, 1e-6, seed=index)
     return Measurements(data.wi, data.wo, data.values, None, data.mask, data.channels, data.source)
 
 
-def run_repeat(index: int, kind: str, data: Measurements, asked: Rows) -> Repeat:
-    """A wrong stack, fitted to what was not asked for."""
+def run_repeat(index: int, kind: str, data: Measurements, held_out: Rows) -> Repeat:
+    """A wrong stack, fitted to all but the held-out measurements, and scores of its predictions of these."""
     began = time.perf_counter()
     noise = fits.Noise(relative=NOISE, floor=1e-6, discrepancy=KINDS[kind])
-    fit = fits.fit(WRONG, data.where(~asked), transport=lj.Statistical(), noise=noise, starts=STARTS, seed=index)
-    unseen = data.where(asked)
-    found = fits.scores(fits.predict(fit, unseen, seed=index), unseen)
-    at = fit.problem.build(fit.vector).correlation
+    fit = fits.fit(WRONG, data.where(~held_out), transport=lj.Statistical(), noise=noise, starts=STARTS, seed=index)
+    test = data.where(held_out)
+    scores = fits.scores(fits.predict(fit, test, seed=index), test)
+    process = fit.problem.build(fit.vector).correlation
     return Repeat(
         repeat=index,
         kind=kind,
         reduced_chi_square=fit.reduced_chi_square,
-        within_95=found.coverage[0.95],
-        within_half=found.coverage[0.5],
-        error=found.median_error,
-        elpd=found.elpd,
-        amplitude=None if at is None else float(at.amplitude),
+        coverage_95=scores.coverage[0.95],
+        coverage_50=scores.coverage[0.5],
+        error=scores.median_error,
+        elpd=scores.elpd,
+        amplitude=None if process is None else float(process.amplitude),
         seconds=time.perf_counter() - began,
     )
 
 
-def _held(directory: Path) -> list[Repeat]:
+def _stored(directory: Path) -> list[Repeat]:
     path = directory / f"{NAME}.json"
     return [Repeat(**record) for record in json.loads(path.read_text())["repeats"]] if path.exists() else []
 
@@ -139,28 +140,28 @@ def _held(directory: Path) -> list[Repeat]:
 def _save(done: list[Repeat], directory: Path) -> tuple[str, tuple[Path, Path]]:
     surroundings = environment.describe()
     rows = [_row(kind, [one for one in done if one.kind == kind]) for kind in KINDS]
-    heads = ("", "in 95 %", "in 50 %", "error", "score", "chi2", "held as asked")
+    heads = ("", "in 95 %", "in 50 %", "error", "elpd", "chi2", "verdict")
     text = TEXT.format(
         environment=environment_lines(surroundings),
         repeats=len(done) // len(KINDS),
         noise=NOISE,
         truth=TRUTH,
         rows=table(heads, rows),
-        low=BAND[0],
-        high=BAND[1],
+        low=COVERAGE[0],
+        high=COVERAGE[1],
     )
     content = {"environment": surroundings, "repeats": [rounded(asdict(one)) for one in done]}
     return text, write(NAME, content, text, directory)
 
 
-def _row(kind: str, found: list[Repeat]) -> tuple[str, ...]:
-    shares = [[one.within_95 for one in found], [one.within_half for one in found]]
+def _row(kind: str, repeats: list[Repeat]) -> tuple[str, ...]:
+    shares = [[one.coverage_95 for one in repeats], [one.coverage_50 for one in repeats]]
     words = [
         f"{100 * np.mean(share):.1f} ± {100 * np.std(share) / max(len(share) - 1, 1) ** 0.5:.1f} %" for share in shares
     ]
     error, chi_square = (
-        float(np.median([getattr(one, name) for one in found])) for name in ("error", "reduced_chi_square")
+        float(np.median([getattr(one, name) for one in repeats])) for name in ("error", "reduced_chi_square")
     )
-    score = float(np.mean([one.elpd for one in found]))
-    held = "yes" if BAND[0] <= np.mean(shares[0]) <= BAND[1] else "**no**"
-    return kind, *words, f"{100 * error:.1f} %", f"{score:.2f}", f"{chi_square:.2f}", held
+    elpd = float(np.mean([one.elpd for one in repeats]))
+    verdict = "met" if COVERAGE[0] <= np.mean(shares[0]) <= COVERAGE[1] else "**not met**"
+    return kind, *words, f"{100 * error:.1f} %", f"{elpd:.2f}", f"{chi_square:.2f}", verdict

@@ -41,7 +41,7 @@ GRAZING_INCIDENCE, GRAZING_VIEW = (60.0, 75.0, 80.0, 85.0, 88.0), (20.0, 45.0, 6
 """Degrees from the normal, and azimuths relative to the light's."""
 
 BESIDE_MIRROR = ((0.0, 180.0), (-4.0, 176.0))
-BESIDE_STRAIGHT = ((-4.0, 176.0), (-8.0, 172.0))
+BESIDE_BALLISTIC = ((-4.0, 176.0), (-8.0, 172.0))
 """Polar angle less that of the light, and relative azimuth, of the directions where narrow lobes stand."""
 
 GROUP = len(VIEW) * len(AZIMUTHS) + len(BESIDE_MIRROR)
@@ -137,7 +137,7 @@ def _directions(incidence: tuple[float, ...], view: tuple[float, ...], transmits
             common = [(polar, azimuth) for polar in view for azimuth in AZIMUTHS]
             for below in (False, True) if transmits else (False,):
                 through = below != from_below
-                beside = [(theta + step, azimuth) for step, azimuth in (BESIDE_STRAIGHT if through else BESIDE_MIRROR)]
+                beside = [(theta + step, azimuth) for step, azimuth in (BESIDE_BALLISTIC if through else BESIDE_MIRROR)]
                 for polar, azimuth in common + beside:
                     lit = 180.0 - theta if from_below else theta
                     seen = 180.0 - polar if below else polar

@@ -7,7 +7,7 @@ import fits
 import layerjax as lj
 
 PARAMETERS = {"ior": 1.5, "alpha": 0.3, "thickness": 1.0, "albedo": 0.95, "g": 0.5, "base": 0.3}
-"""Of the interface the first two, of the haze the next three, then the albedo of the base."""
+"""Index and roughness of the interface; thickness, albedo and asymmetry of the haze; albedo of the base."""
 
 INCIDENCE = (10.0, 30.0, 50.0, 70.0)
 
@@ -19,7 +19,7 @@ def stack_of(parameters: Mapping[str, Any] = PARAMETERS) -> lj.Stack:
     return lj.Stack([lj.Interface(p["ior"], p["alpha"]), haze], lj.Lambertian(p["base"]))
 
 
-def readings() -> fits.Geometry:
+def goniometer_slices() -> fits.Geometry:
     """140 pairs of directions in the plane of incidence, 35 for each of four incidences."""
     return fits.slices(incidence=INCIDENCE)
 

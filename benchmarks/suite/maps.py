@@ -1,8 +1,8 @@
-"""A map whose truth is known: roughness and thickness painted over a plate, and readings of every texel.
+"""A map whose truth is known: roughness and thickness painted over a plate, and measurements of every texel.
 
 The plate is a coat whose roughness and thickness drift smoothly, with an emblem on it, a star in a ring: within it both
-jump. All else is the same everywhere, unless two more numbers are painted, which drift alone. It is read along 64 pairs
-of directions, with noise.
+jump. All else is the same everywhere, unless two more numbers are painted, which drift alone. It is measured along 64
+pairs of directions, with noise.
 """
 
 import math
@@ -28,7 +28,7 @@ ROUGHNESS, THICKNESS, SHARED = (0.08, 0.5), (0.2, 3.0), 0.3
 
 
 class Painted(NamedTuple):
-    """A map that was painted, and what is read of it.
+    """A map that was painted, and its measurements.
 
     truth: of each free parameter, by its name in a fit, (H, W). values: (H, W, 64, 1), in 1/sr. stack: with `fits.Free`
     where the truth is to be found.
@@ -63,23 +63,23 @@ def painted(
     shared: bool = False,
     free: Literal[2, 4] = 2,
 ) -> Painted:
-    """Paint a map and read it.
+    """Paint a map and simulate its measurements.
 
     Args:
         shape: texels along its two sides.
-        transport: by which the readings are made; "auto" and an open resolution are chosen for `TOGETHER` texels.
+        transport: of the simulation; "auto" or an unset resolution is chosen for `TOGETHER` texels.
         material: "coat": a rough dielectric over haze on a diffuse base, which takes all orders of scattering.
             "flakes": SGGX flakes on a diffuse base, which `SingleScattering` carries as well. "metal": a rough
             dielectric over a dye on metal, which `Statistical` carries.
-        noise: relative standard deviation of a reading.
-        seed: of the noise.
+        noise: relative standard deviation of a measurement.
+        seed: random seed of the noise.
         shared: whether the albedo of the base is free too, as one number for all texels (of two numbers painted).
         free: how many numbers are painted; of four the last two are the index of the coat or the albedo of the flakes,
             and the albedo of the base or the roughness of the metal.
     """
     numbers = NUMBERS[material][:free]
     truth = dict(zip((one.name for one in numbers), wash(shape, numbers), strict=True))
-    geometry = readings()
+    geometry = goniometer_slices()
     exact = values_of(_BUILD[material], [*truth.values()], geometry, transport)
     noisy = exact * (1.0 + noise * np.random.default_rng(seed).standard_normal(exact.shape))
     more: dict[str, Any] = {}
@@ -89,7 +89,7 @@ def painted(
     return Painted(truth, geometry, noisy, stack, fits.Noise(relative=noise))
 
 
-def readings() -> fits.Geometry:
+def goniometer_slices() -> fits.Geometry:
     """64 pairs of directions in the plane of incidence: 16 for each of four incidences, mirror and retro among them."""
     return fits.slices(incidence=(10.0, 30.0, 50.0, 70.0), outgoing=np.arange(-70.0, 81.0, 10.0))
 
@@ -105,7 +105,7 @@ def emblem(shape: tuple[int, int]) -> tuple[Floats, Floats]:
     ripple = 0.5 + 0.5 * np.sin(4.0 * y + 1.5 * np.sin(2.0 * x))
     rough = np.where(star, 0.35 * drift, np.where(ring, 0.6 + 0.4 * drift, 0.3 + 0.5 * drift))
     thick = np.where(star, 0.55 + 0.45 * ripple, np.where(ring, 0.3 * ripple, 0.2 + 0.5 * ripple))
-    return _between(ROUGHNESS, rough), _between(THICKNESS, thick)
+    return _interpolated(ROUGHNESS, rough), _interpolated(THICKNESS, thick)
 
 
 def wash(shape: tuple[int, int], numbers: Sequence[Number]) -> list[Floats]:
@@ -133,7 +133,7 @@ def values_of(
     return np.concatenate(parts).reshape(*maps[0].shape, len(geometry), -1)
 
 
-def _between(ends: tuple[float, float], share: Floats) -> Floats:
+def _interpolated(ends: tuple[float, float], share: Floats) -> Floats:
     low, high = ends
     return low * (high / low) ** share
 
@@ -144,8 +144,8 @@ def _channel(number: Any) -> Any:
 
 
 def _coat(alpha: Any, thickness: Any, ior: Any = PARAMETERS["ior"], base: Any = SHARED) -> lj.Stack:
-    given = {"alpha": alpha, "thickness": _channel(thickness), "ior": ior, "base": _channel(base)}
-    return stack_of(PARAMETERS | given)
+    numbers = {"alpha": alpha, "thickness": _channel(thickness), "ior": ior, "base": _channel(base)}
+    return stack_of(PARAMETERS | numbers)
 
 
 def _flakes(alpha: Any, thickness: Any, albedo: Any = 0.8, base: Any = SHARED) -> lj.Stack:
@@ -168,7 +168,7 @@ _ALPHA, _THICKNESS = _logarithmic(0.2, 0.02, 1.0), _logarithmic(1.0, 0.05, 10.0)
 
 NUMBERS: dict[Material, tuple[Number, ...]] = {
     "coat": (
-        # a box for which a table of all orders takes some thousand solutions
+        # a box for which an emulator of all orders takes some thousand solutions
         Number("layers[0].alpha", *ROUGHNESS, _logarithmic(0.2, 0.05, 0.6)),
         Number("layers[1].thickness", *THICKNESS, _logarithmic(1.0, 0.1, 5.0)),
         Number("layers[0].ior", 1.4, 1.7, fits.Free(1.5, 1.3, 1.8)),
@@ -192,4 +192,4 @@ NUMBERS: dict[Material, tuple[Number, ...]] = {
 NAMES: dict[Material, tuple[str, str]] = {
     material: (numbers[0].name, numbers[1].name) for material, numbers in NUMBERS.items()
 }
-"""Of roughness and thickness, as fits call them."""
+"""Parameter names of roughness and thickness in a fit."""

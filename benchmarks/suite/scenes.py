@@ -31,7 +31,7 @@ TWO_LAYERS = {
 
 @dataclass(frozen=True)
 class Scene:
-    """A material and the pairs that are asked for. build: parameters (traced or not) to a stack."""
+    """A material and the pairs at which it is evaluated. build: parameters (traced or not) to a stack."""
 
     name: str
     parameters: Parameters

@@ -70,6 +70,7 @@ def sample(arguments: Namespace) -> int:
     if not arguments.force and chain.is_file() and (kept := Store.read(chain)).fingerprint:
         sampler, walkers, _ = settings_of(kept)
     settings: dict[str, Any] = {name: getattr(arguments, name) for name in ("ess", "max_steps", "allow_unconverged")}
+    walkers = walkers if arguments.sampler in (None, sampler) else None
     settings |= {"sampler": arguments.sampler or sampler, "walkers": arguments.walkers or walkers}
     with show_progress() as progress, hint(f"the chain is kept, `layerjax sample {directory}` resumes it"):
         posterior = run_sampler(result, **settings, path=chain, resume=not arguments.force, progress=progress)

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, NamedTuple, cast, get_args
+from typing import Any, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
@@ -24,7 +24,6 @@ from fits.names import Objective
 from fits.optimise.levenberg_marquardt import COST_TOLERANCE, ROUGH_TOLERANCE
 from fits.optimise.multi_start import (
     Optimum,
-    Solver,
     multi_start,
     polish,
     rough_descent,
@@ -67,7 +66,6 @@ def fit(
     instrument: Instrument | None = None,
     starts: int = 32,
     seed: int = 0,
-    solver: Solver = "least_squares",
     options: FitOptions = DEFAULT,
     progress: Progress | None = None,
     checkpoint: str | Path | None = None,
@@ -83,9 +81,8 @@ def fit(
             within reach. `Fit.problem` has it.
         noise, scale, objective, instrument: see `Problem`.
         starts: at least 1: the `Free.start` values, then scrambled Sobol points of the box (in the logarithm for
-            parameters with a `LogNormal` or `LogUniform` prior), drawn with `seed`. The lowest end of all is the fit.
-        solver: "least_squares" (Levenberg-Marquardt, checked with L-BFGS-B where a parameter ends on a bound), or
-            "bounded" (L-BFGS-B throughout).
+            parameters with a `LogNormal` or `LogUniform` prior), drawn with `seed`. The lowest end of all is the fit;
+            where a parameter ends on a bound, L-BFGS-B checks it.
         options: tolerances and thresholds.
         progress: called with ("fit", starts done, starts, note).
         checkpoint: a file that each start is kept in as it ends: a fit that was killed takes those that are there for
@@ -95,7 +92,7 @@ def fit(
             lowest after a few steps, and stop near the minimum: enough to rank stacks.
 
     Raises:
-        ValueError: as `Problem`; starts < 1; an unknown solver.
+        ValueError: as `Problem`; starts < 1.
     """
     if isinstance(stack, FittingProblem):
         arguments: dict[str, Any] = {"data": data, "noise": noise, "scale": scale, "instrument": instrument}
@@ -119,10 +116,8 @@ def fit(
     require_seed(seed)
     require_switch("screen", screen)
     checkpoint = None if checkpoint is None else given_path("checkpoint", checkpoint)
-    if solver not in get_args(Solver):
-        raise ValueError(f"solver is {solver!r}; it must be one of {', '.join(get_args(Solver))}")
     require_kind("options", options, FitOptions)
-    run = _Run(starts, seed, solver, options, given_progress(progress), checkpoint, screen)
+    run = _Run(starts, seed, options, given_progress(progress), checkpoint, screen)
     independent = _fit_from(problem, start_points(problem, starts, seed), run)
     before = {
         name: found
@@ -137,13 +132,13 @@ def fit_with_discrepancy(
 ) -> Fit:
     """The fit of a problem with model discrepancy, after one with independent noise; arguments as of `fit`."""
     before = {name: without_discrepancy(independent.part(name)) for name in problem.problems}
-    return _with_discrepancy(problem, independent, before, _Run(starts, seed, options=options))
+    return _with_discrepancy(problem, independent, before, _Run(starts, seed, options))
 
 
 def refit(problem: Problem, *vectors: Floats) -> Fit:
     """The fit of a problem with minima near these vectors (P,), roughly, at the resolution that the problem has."""
     ends = [rough_descent(problem, unit_of(problem, vector), fresh=False) for vector in vectors]
-    best = polish(problem, ends, "least_squares", check=False, tolerance=ROUGH_TOLERANCE)
+    best = polish(problem, ends, check=False, tolerance=ROUGH_TOLERANCE)
     return _result(best, None, _Run(len(ends)), {})
 
 
@@ -157,7 +152,6 @@ class _Run(NamedTuple):
 
     starts: int
     seed: int = 0
-    solver: Solver = "least_squares"
     options: FitOptions = DEFAULT
     progress: Progress = silent
     checkpoint: str | Path | None = None
@@ -231,19 +225,19 @@ def _fit_from(
     coarse = {name: replace(problem.problems[name], transport=one.far) for name, one in known.items() if one.open}
     problem = problem.with_problems(coarse)
     problem = problem.with_problems({name: rings_for_starts(problem.problems[name]) for name in open_rays})
-    if run.screen and run.solver == "least_squares":
+    if run.screen:
         ends = screened_starts(problem, points)
     elif run.checkpoint is None:
-        ends = multi_start(problem, points, run.solver, run.progress)
+        ends = multi_start(problem, points, run.progress)
     else:  # each is kept as it ends
-        with starts_store(run.checkpoint, problem, points, run.solver) as store:
-            ends = multi_start(problem, points, run.solver, run.progress, store)
+        with starts_store(run.checkpoint, problem, points) as store:
+            ends = multi_start(problem, points, run.progress, store)
     # 2. the lowest of them, to its very minimum, with the uncertainties there
-    at = polish(problem, ends, run.solver, tolerance=ROUGH_TOLERANCE if run.screen else COST_TOLERANCE)
+    at = polish(problem, ends, tolerance=ROUGH_TOLERANCE if run.screen else COST_TOLERANCE)
     # 3. at the resolution that the noise of the data asks for
     accuracy = None
     if not run.screen and (known or any(map(has_rays, problem.problems.values()))):
-        at, accuracy = refined(at, known, open_rays, run.solver, run.options, run.progress)
+        at, accuracy = refined(at, known, open_rays, run.options, run.progress)
     # 4. what follows from it
     return _result(at, accuracy, run, without)
 
@@ -269,7 +263,7 @@ def _result(at: Optimum, accuracy: Accuracy | None, run: _Run, without: Mapping[
         insensitive=found.insensitive,
         minima=minima,
         alternatives=tuple(minimum for minimum in minima[1:] if minimum.cost - lowest.cost < equivalent),
-        settings={"starts": run.starts, "seed": run.seed, "solver": run.solver, **asdict(options)},
+        settings={"starts": run.starts, "seed": run.seed, **asdict(options)},
         start_outcomes=outcomes,
         numerical_error=None if accuracy is None else accuracy.error,
         resolution=None if accuracy is None else accuracy.resolution,

@@ -1,17 +1,15 @@
 """The starts of a fit: where they begin, where each of them ends, and the lowest followed to its very minimum.
 
 Levenberg-Marquardt follows them. L-BFGS-B of scipy, by jaxopt and with gradients only, shares nothing with it but the
-objective: it checks a minimum that lies on a bound or has not converged, and can take all starts, where Gauss-Newton
-steps stall. A start that reaches the maximum of steps is continued while it gains something: the number of steps says
-nothing about how good its outcome is.
+objective: it checks a minimum that lies on a bound or has not converged. A start that reaches the maximum of steps is
+continued while it gains something: the number of steps says nothing about how good its outcome is.
 """
 
 import warnings
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -23,13 +21,12 @@ import layerjax
 from fits.optimise.levenberg_marquardt import COST_TOLERANCE, ROUGH_TOLERANCE, Descent, descent, evaluate_at
 from fits.optimise.uncertainty import Uncertainty, uncertainty
 from fits.problem.compilation import cores
-from fits.problem.model import Density, Model, half_squares
+from fits.problem.model import Model
 from fits.problem.problem import FittingProblem
 from fits.progress import Progress
 from fits.store import Store, fingerprint
 from layerjax._numerics import broadcasting
 
-Solver = Literal["least_squares", "bounded"]
 Floats = NDArray[np.float64]
 
 MOST_STEPS = 200
@@ -70,10 +67,9 @@ def start_points(problem: FittingProblem, starts: int, seed: int) -> Floats:
 
 
 def multi_start(
-    problem: FittingProblem, points: Floats, solver: Solver, progress: Progress, store: Store | None = None
+    problem: FittingProblem, points: Floats, progress: Progress, store: Store | None = None
 ) -> list[StartOutcome]:
     """Where each of the points (starts, P) in the unit box ends, roughly; those that are in the store are not run."""
-    solve = rough_descent if solver == "least_squares" else bounded_descent
     ends: dict[int, StartOutcome] = {}
 
     def ended(index: int, end: StartOutcome, new: bool = True) -> None:
@@ -87,10 +83,10 @@ def multi_start(
             ended(index, StartOutcome(**stored), new=False)
     left = [index for index in range(len(points)) if index not in ends]
     for index in left[:1]:  # alone: it compiles the program, which keeps one core busy
-        ended(index, solve(problem, points[index]))
+        ended(index, rough_descent(problem, points[index]))
     pool = ThreadPoolExecutor(cores())
     try:
-        running = {pool.submit(broadcasting(solve), problem, points[index]): index for index in left[1:]}
+        running = {pool.submit(broadcasting(rough_descent), problem, points[index]): index for index in left[1:]}
         for future in as_completed(running):
             ended(running[future], future.result())
     finally:
@@ -98,14 +94,11 @@ def multi_start(
     return [ends[index] for index in range(len(points))]
 
 
-def starts_store(
-    checkpoint: str | Path, problem: FittingProblem, points: Floats, solver: Solver
-) -> AbstractContextManager[Store]:
+def starts_store(checkpoint: str | Path, problem: FittingProblem, points: Floats) -> AbstractContextManager[Store]:
     """The store of the starts of a fit; starts of another fit that are there are thrown away."""
     arrays, static = problem.split_model
     whose = fingerprint(
         version=layerjax.__version__,
-        solver=solver,
         starts=points,
         parameters=problem.names,
         model=static.tree,
@@ -162,45 +155,6 @@ def unit_of(problem: FittingProblem, vector: Floats) -> Floats:
     return np.asarray(problem.model.box.to_unit(jnp.asarray(vector)), float)
 
 
-def cost_and_gradient(model: Model, unit: Any) -> tuple[Any, Any]:
-    """Half the sum of squared residuals at a point (P,) of the unit box, and its gradient (P,) there."""
-    return jax.value_and_grad(lambda s: half_squares(model.residuals(model.box.from_unit(s))))(unit)
-
-
-def minimise_in_box(
-    value_and_gradient: Callable[[Any], tuple[Any, Any]],
-    start: NDArray[np.float64],
-    tolerance: float = LBFGSB_TOLERANCE,
-) -> tuple[NDArray[np.float64], float, int, bool]:
-    """Minimise from `start` (P,) in the unit box: the point, its cost, the iterations, and whether it converged.
-
-    tolerance: it ends where a step gains less than this share of the cost, or where the gradient is smaller.
-    """
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message="JAXopt is no longer maintained", category=DeprecationWarning)
-        from jaxopt import ScipyBoundedMinimize
-
-    solver = ScipyBoundedMinimize(
-        fun=value_and_gradient,
-        method="l-bfgs-b",
-        value_and_grad=True,
-        jit=False,  # the function is compiled already, and for all problems of this structure
-        tol=tolerance,
-        maxiter=LBFGSB_STEPS,
-    )
-    inside = jnp.clip(jnp.asarray(start), 0.0, 1.0)
-    point, info = solver.run(inside, bounds=(jnp.zeros_like(inside), jnp.ones_like(inside)))
-    lowest = float(info.fun_val)
-    return np.asarray(point, float), lowest, int(info.iter_num), bool(info.success) and bool(np.isfinite(lowest))
-
-
-def bounded_descent(problem: FittingProblem, point: Floats, fresh: bool = True) -> StartOutcome:
-    """L-BFGS-B from a point (P,) in the unit box."""
-    unit, cost, steps, converged = minimise_in_box(lambda s: problem.call(cost_and_gradient, s), point)
-    vector = np.asarray(problem.model.box.from_unit(jnp.asarray(unit)), float)
-    return StartOutcome(vector, cost if np.isfinite(cost) else np.inf, steps, converged, False)
-
-
 def lbfgsb_polish(problem: FittingProblem, end: StartOutcome) -> tuple[StartOutcome, bool]:
     """The end, or what L-BFGS-B and then Levenberg-Marquardt make of it if that is lower; and whether it is.
 
@@ -213,8 +167,22 @@ def lbfgsb_polish(problem: FittingProblem, end: StartOutcome) -> tuple[StartOutc
         return found.cost, found.gradient
 
     enough = LEAST_STEP_GAIN / max(abs(end.cost), 1.0) if problem.objective == "likelihood" else LBFGSB_TOLERANCE
-    point, _, _, settled = minimise_in_box(value_and_gradient, unit_of(problem, end.vector), enough)
-    other = least_squares_descent(problem, point, fresh=False)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="JAXopt is no longer maintained", category=DeprecationWarning)
+        from jaxopt import ScipyBoundedMinimize
+
+    solver = ScipyBoundedMinimize(
+        fun=value_and_gradient,
+        method="l-bfgs-b",
+        value_and_grad=True,
+        jit=False,  # the function is compiled already, and for all problems of this structure
+        tol=enough,
+        maxiter=LBFGSB_STEPS,
+    )
+    begin = jnp.clip(jnp.asarray(unit_of(problem, end.vector)), 0.0, 1.0)
+    point, info = solver.run(begin, bounds=(jnp.zeros_like(begin), jnp.ones_like(begin)))
+    settled = bool(info.success) and bool(np.isfinite(info.fun_val))
+    other = least_squares_descent(problem, np.asarray(point, float), fresh=False)
     if other.cost < end.cost - max(COST_TOLERANCE, 1e-9 * abs(end.cost)):
         return other._replace(converged=other.converged or settled, steps=end.steps + other.steps), True
     return end._replace(converged=end.converged or other.converged or settled), False
@@ -247,7 +215,6 @@ class Optimum(NamedTuple):
 def polish(
     problem: FittingProblem,
     ends: list[StartOutcome],
-    solver: Solver,
     *,
     check: bool = True,
     tolerance: float = COST_TOLERANCE,
@@ -259,24 +226,23 @@ def polish(
     """
     best, improved = int(np.argmin([end.cost for end in ends])), False
     lowest, likelihood = ends[best], problem.objective == "likelihood"
-    least_squares = solver == "least_squares"
     # 1. closer to its minimum
-    if least_squares and likelihood and lowest.converged and tolerance < ROUGH_TOLERANCE:
+    if likelihood and lowest.converged and tolerance < ROUGH_TOLERANCE:
         closer = least_squares_descent(problem, unit_of(problem, lowest.vector), False, tolerance)
         if closer.cost <= lowest.cost:
             lowest = closer._replace(steps=lowest.steps + closer.steps)
     found = uncertainty(problem, lowest.vector, lowest.cost)
     # 2. no step leads off a plateau, where every start may end though another minimum is far lower: insensitive
     # parameters and those at a bound begin anew
-    if least_squares and check and found.insensitive:
+    if check and found.insensitive:
         stuck = np.isin(problem.names, found.insensitive) | found.at_bound
         point = np.where(stuck, unit_of(problem, problem.start), unit_of(problem, lowest.vector))
         other = least_squares_descent(problem, point, tolerance=tolerance)
         if other.cost < lowest.cost - (ROUGH_TOLERANCE if likelihood else LEAST_RELATIVE_GAIN * lowest.cost):
             lowest = other._replace(steps=lowest.steps + other.steps)
             found = uncertainty(problem, lowest.vector, lowest.cost)
-    # 3. checked by the other solver
-    if least_squares and ((check and found.at_bound.any()) or not lowest.converged):
+    # 3. checked by L-BFGS-B
+    if (check and found.at_bound.any()) or not lowest.converged:
         lowest, improved = lbfgsb_polish(problem, lowest)
         found = uncertainty(problem, lowest.vector, lowest.cost) if improved else found
     # 4. exactly on the bounds that hold it
@@ -287,7 +253,7 @@ def polish(
     # 5. the reduced chi-square where it is above 1; of a named objective, the residual variance
     freedom = max(problem.count - len(lowest.vector), 1)
     if likelihood:
-        excess = max(1.0, float(problem.call(Density.chi_square_at, lowest.vector, predicted)) / freedom)
+        excess = max(1.0, float(problem.call(Model.chi_square_at, lowest.vector, predicted)) / freedom)
         excess = excess if problem.count > len(lowest.vector) else 1.0
     else:
         excess = 2.0 * lowest.cost / freedom

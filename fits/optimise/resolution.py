@@ -19,11 +19,11 @@ from jax import Array
 from numpy.typing import NDArray
 
 import layerjax as lj
-from fits.optimise.multi_start import Optimum, Solver, StartOutcome, bounded_descent, polish, rough_descent, unit_of
+from fits.optimise.multi_start import Optimum, StartOutcome, polish, rough_descent, unit_of
 from fits.optimise.options import FitOptions
 from fits.problem.apertures import most_rings
 from fits.problem.instrument import rings_for
-from fits.problem.model import Density, Model
+from fits.problem.model import Model
 from fits.problem.problem import FittingProblem, Problem
 from fits.progress import Progress
 from layerjax.mixture import stacks_of
@@ -316,7 +316,6 @@ def refined(
     at: Optimum,
     known: Mapping[str, Resolutions],
     open_rays: Set[str],
-    solver: Solver,
     options: FitOptions,
     progress: Progress,
 ) -> tuple[Optimum, Accuracy]:
@@ -357,8 +356,8 @@ def refined(
             return at, Accuracy(resolution, float(np.max([one.error for one in accuracies.values()])), words)
         whole = at.problem.with_problems(changed)
         words = _by_name({name: resolution_in_words(whole.problems[name], known.get(name)) for name in accuracies})
-        ends = _fitted_again(at, whole, solver, words, options.equivalent_cost, progress)
-        again = polish(whole, ends, solver, check=at.improved)
+        ends = _fitted_again(at, whole, words, options.equivalent_cost, progress)
+        again = polish(whole, ends, check=at.improved)
         at = again._replace(improved=again.improved or at.improved)
 
 
@@ -380,13 +379,12 @@ def _by_name(words: Mapping[str, str]) -> str:
 
 
 def _fitted_again(
-    at: Optimum, problem: FittingProblem, solver: Solver, words: str, equivalent: float, progress: Progress
+    at: Optimum, problem: FittingProblem, words: str, equivalent: float, progress: Progress
 ) -> list[StartOutcome]:
     """The ends at another resolution: those that matter fitted again, the cost of the others there."""
-    solve = rough_descent if solver == "least_squares" else bounded_descent
 
     def cost(end: StartOutcome) -> float:
-        found = float(problem.call(Density.cost_at, end.vector, problem.predict(end.vector)))
+        found = float(problem.call(Model.cost_at, end.vector, problem.predict(end.vector)))
         return found if np.isfinite(found) else np.inf
 
     # 1. ends that lie close together count as one, lowest first
@@ -408,7 +406,7 @@ def _fitted_again(
     wanted, fitted, done = [int(index) for index in matter[:MOST_MINIMA]], set[int](), 0
     while wanted:
         for index in wanted:
-            end = solve(problem, unit_of(problem, before[index].vector), False)
+            end = rough_descent(problem, unit_of(problem, before[index].vector), False)
             ends[index] = end._replace(steps=before[index].steps + end.steps)
             fitted.add(index)
             done += 1

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from fits._lazy import shown_by
 from fits.optimise.uncertainty import Direction
-from fits.problem.model import Density
+from fits.problem.model import Model
 from fits.problem.problem import Problem
 
 Floats = NDArray[np.float64]
@@ -72,7 +72,7 @@ class Fit:
             `errors` and `covariance` are of the best alone; `fits.sample`, `fits.predict` and `fits.evidence` count all
             that hold a share of the posterior.
         insensitive: names of the parameters that the data say nothing about.
-        settings: starts, seed, solver, and the numbers of `FitOptions`.
+        settings: starts, seed, and the numbers of `FitOptions`.
         start_outcomes: how many starts ended where: "best minimum", "local minima", "maximum steps reached", "failed".
         numerical_error: of the model at the best values, in standard deviations of the data (for a named objective, of
             the residuals): the largest, as the difference from a finer resolution tells, or where that is out of reach
@@ -219,12 +219,12 @@ class Fit:
         With correlated noise these are whitened: K^-1/2 times the differences, with K their covariance. Under the
         assumed model they are independent standard normal; `chi_square` is the sum of their squares.
         """
-        return np.asarray(self.problem.call(Density.whitened_residuals_at, self.vector, self.predicted), float)
+        return np.asarray(self.problem.call(Model.whitened_residuals_at, self.vector, self.predicted), float)
 
     @cached_property
     def chi_square(self) -> float:
         """Sum of squared `residuals`, with correlated noise by its covariance; a named objective's has no scale."""
-        return float(self.problem.call(Density.chi_square_at, self.vector, self.predicted))
+        return float(self.problem.call(Model.chi_square_at, self.vector, self.predicted))
 
     @property
     def degrees_of_freedom(self) -> int:
@@ -241,7 +241,7 @@ class Fit:
         """Normalised log-likelihood of the best values; NaN for a named objective."""
         if not self.is_posterior:
             return float("nan")
-        return float(self.problem.call(Density.log_likelihood_at, self.vector, self.predicted))
+        return float(self.problem.call(Model.log_likelihood_at, self.vector, self.predicted))
 
     @property
     def correlation(self) -> Floats:

@@ -1,6 +1,6 @@
 """What the data say about the parameters at an optimum: errors, correlations, and the directions they do not identify.
 
-All follow from the Fisher information A'A (see `Density.linear_parts`), with one column of A a parameter in units of
+All follow from the Fisher information A'A (see `Model.linear_parts`), with one column of A a parameter in units of
 its box. A singular value s of A says that the parameters can move by 1 / s of their boxes along its direction before
 the fit worsens by one standard deviation; neither priors nor bounds count there, which may hold a parameter that the
 data do not. It is a statement about small changes: along a curved valley the direction turns.

@@ -123,19 +123,14 @@ def _require_comparable(fits: Mapping[str, Fit]) -> None:
         fit.require_one("compare")
     first_name, first = next(iter(fits.items()))
     for name, fit in fits.items():
-        if not _same_data(first, fit):
+        pairs = [(getattr(first.problem.model, one), getattr(fit.problem.model, one)) for one in ("wi", "wo", "values")]
+        if not all(a.shape == b.shape and np.allclose(a, b, rtol=1e-9, atol=1e-12) for a, b in pairs):
             raise ValueError(f"compare: {first_name!r} and {name!r} were fitted to different data")
         if fit.problem.objective != first.problem.objective:
             raise ValueError(
                 f"compare: {first_name!r} minimised {first.problem.objective!r}, {name!r} {fit.problem.objective!r}; "
                 "only fits of one objective can be compared"
             )
-
-
-def _same_data(one: Fit, other: Fit) -> bool:
-    first, second = one.problem.model, other.problem.model
-    pairs = ((first.wi, second.wi), (first.wo, second.wo), (first.values, second.values))
-    return all(a.shape == b.shape and np.allclose(a, b, rtol=1e-9, atol=1e-12) for a, b in pairs)
 
 
 def _leave_one_out(posteriors: Mapping[str, Posterior], options: ComparisonOptions) -> dict[str, dict[str, Any]]:

@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import minimize
 from scipy.special import log_softmax, logsumexp, softmax
 
+from fits.data.geometry import Floats
 from fits.data.measurements import Measurements
 from fits.data.scans import incidences, scans
 from fits.optimise.fit import refit
@@ -44,7 +45,6 @@ INFINITE_NOISE = 1e8
 LARGEST_LOG_RATIO = 30.0
 """Bound of the logarithms of ratios of stacking weights."""
 
-Floats = NDArray[np.float64]
 
 Checkpoint = Callable[[str, Callable[[], Any]], Any]
 """Gives the record of this name: what the call computes, or what an earlier run has kept of it."""
@@ -80,11 +80,6 @@ class CrossValidation:
     def error(self) -> float:
         """Standard error of the elpd by the number of draws of the posterior."""
         return float(np.linalg.norm(self.errors))
-
-    @property
-    def group_sizes(self) -> NDArray[np.int64]:
-        """Measurements times channels of each group, (G,)."""
-        return np.array([self.log_density[rows].size for rows in self.rows])
 
 
 @programs_kept()
@@ -286,7 +281,7 @@ def rank_models(
         gaps = best.elpd_by_group - one.elpd_by_group
         elpd_diff, dse = float(gaps.sum()), float(np.sqrt(gaps.size) * gaps.std(ddof=1))
         dse = math.hypot(dse, 0.0 if one is best else math.hypot(one.error, best.error))
-        least_diff = float(np.min(gaps / best.group_sizes))
+        least_diff = float(np.min(gaps / [best.log_density[rows].size for rows in best.rows]))
         decisive = least_diff > options.decisive_per_measurement
         scores[name] = ModelScore(
             elpd=one.elpd,

@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import logsumexp
 
+from fits.data.geometry import Floats
 from fits.optimise.result import Fit
 from fits.prediction.options import ComparisonOptions
-from fits.problem.compilation import in_shares
 from fits.sampling.initial import initial_mixture, log_posteriors
 from fits.sampling.proposals import Density, FittedProposal
 from layerjax._checks import require_count, require_kind, require_seed
@@ -37,8 +37,6 @@ DRAWS = 1000
 
 BATCH = 50
 """Draws that a core evaluates at a time: however many there are, one program serves."""
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,12 +90,12 @@ def importance_draws(
     proposal: an approximation of a posterior similar to the fit's.
     """
     pool = _Pool(fit, draws, generator)
-    weighted = pool.add(initial_mixture(fit, along_ridges=along_ridge))
+    weighted = pool.add(initial_mixture(fit, BATCH, along_ridges=along_ridge))
     if not along_ridge and not weighted.suffices(MAX_PARETO_K):
         if proposal is not None:
             weighted = pool.adapt(pool.add(proposal), max_pareto_k)
         if not weighted.suffices(MAX_PARETO_K):
-            weighted = pool.add(initial_mixture(fit))
+            weighted = pool.add(initial_mixture(fit, BATCH))
     return pool.adapt(weighted, max_pareto_k)
 
 
@@ -113,7 +111,7 @@ class _Pool:
     def add(self, proposal: Density) -> ImportanceDraws:
         """Add draws of a proposal; returns all draws of the pool."""
         positions = proposal.draw(self.generator, self.draws)
-        (log_posterior,) = in_shares(lambda part: [self.fit.problem.call(log_posteriors, part)], positions, BATCH)
+        log_posterior = log_posteriors(self.fit.problem, positions, BATCH)
         self.proposals.append(proposal)
         self.positions = np.concatenate([self.positions, positions])
         self.log_posterior = np.append(self.log_posterior, log_posterior)

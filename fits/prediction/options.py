@@ -1,9 +1,8 @@
 """Thresholds of the verdicts of a model comparison."""
 
 from dataclasses import dataclass, fields
-from numbers import Real
 
-from layerjax._checks import in_short, require_count
+from layerjax._checks import require_count, require_number
 
 
 @dataclass(frozen=True)
@@ -48,8 +47,6 @@ class ComparisonOptions:
 
     def __post_init__(self) -> None:
         for field in fields(self):
-            value = getattr(self, field.name)
-            if not (isinstance(value, Real) and float(value) > 0.0):
-                raise ValueError(f"{field.name} is {in_short(value)}; it must be a number above 0")
+            require_number(field.name, getattr(self, field.name), 0.0, open_ends=True)
         for name, least in (("min_incidences", 1), ("scan_parts", 2), ("most_draws", 1)):
             require_count(name, getattr(self, name), least)

@@ -9,8 +9,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from numbers import Real
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
@@ -20,7 +19,7 @@ from numpy.typing import NDArray
 from scipy import stats
 from scipy.special import logsumexp
 
-from fits.data.geometry import Geometry
+from fits.data.geometry import Floats, Geometry
 from fits.data.measurements import TO_HAVE_THEM, Measurements, Source
 from fits.data.totals import Totals
 from fits.optimise.result import Fit
@@ -33,10 +32,11 @@ from fits.problem.problem import polar_angles
 from fits.problem.simulate import require_visible
 from fits.sampling.initial import normal_draws
 from fits.sampling.posterior import Posterior
-from layerjax._checks import in_short, require_count, require_kind, require_seed
+from layerjax._checks import in_short, require_count, require_kind, require_number, require_seed
 from layerjax.compiling import programs_kept
 
 if TYPE_CHECKING:
+    from fits.prediction.average import Average
     from fits.sampling.proposals import Density
 
 LEVELS = (0.025, 0.25, 0.5, 0.75, 0.975)
@@ -59,8 +59,6 @@ BISECTIONS = 50
 
 SMALLEST_SD = 1e-12
 """The least standard deviation of the discrepancy, where the data determine it: its distribution keeps a density."""
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,14 +149,14 @@ class Prediction:
 
     def quantile(self, level: float) -> Floats:
         """Quantile of the BSDF, (M, C), in 1/sr; level in (0, 1)."""
-        require_level(level)
+        require_number("level", level, 0.0, 1.0, open_ends=True)
         if self.discrepancy_sd is None:
             return np.quantile(self.values, level, axis=0)
         return self._mixture_quantile(level, np.maximum(self.discrepancy_sd, SMALLEST_SD), stats.norm())
 
     def predictive_quantile(self, level: float) -> Floats:
         """Quantile of a new measurement, (M, C), in 1/sr; level in (0, 1)."""
-        require_level(level)
+        require_number("level", level, 0.0, 1.0, open_ends=True)
         return self._mixture_quantile(level, self.scales, self._noise)
 
     def _mixture_quantile(self, level: float, scales: Floats, distribution: "stats.rv_frozen") -> Floats:
@@ -260,22 +258,9 @@ def scores(prediction: Prediction, measurements: Measurements, rows: NDArray[np.
     )
 
 
-def require_level(level: float, name: str = "level") -> None:
-    if not (isinstance(level, Real) and 0.0 < float(level) < 1.0):
-        raise ValueError(f"{name} is {in_short(level)}; it must be in (0, 1)")
-
-
-class Predictor(Protocol):
-    """Several fits that predict as one: see `fits.average`."""
-
-    def predict(
-        self, at: Geometry | Measurements, *, levels: tuple[float, ...], draws: int, seed: int
-    ) -> Prediction: ...
-
-
 @programs_kept()
 def predict(
-    fitted: Fit | Posterior | Predictor,
+    fitted: "Fit | Posterior | Average",
     at: Geometry | Measurements,
     *,
     levels: tuple[float, ...] = LEVELS,
@@ -301,7 +286,7 @@ def predict(
     """
     require_kind("levels", levels, tuple, list, np.ndarray)
     for place, level in enumerate(levels):
-        require_level(level, f"levels[{place}]")
+        require_number(f"levels[{place}]", level, 0.0, 1.0, open_ends=True)
     require_count("draws", draws, 2)
     require_seed(seed)
     require_kind("at", at, Geometry, Measurements, fix=TO_HAVE_THEM)

@@ -3,7 +3,6 @@
 Where it has to be follows from what the stack may hold (`spread_over_lobes`); how many rays stand for the cones from
 their width beside the lobe there (`ray_counts`).
 
-
 A cone is a disc of directions: Gauss's rule in the squared radius, and rings of evenly spread azimuths. A mean over a
 disc of radius q of a lobe 1 / (1 + h^2)^2, as GGX facets of unit width have it, is then within 1e-3 of its peak for
 q up to 0.41 n - 0.16 with n rings of 3 n + 1 rays, wherever the disc lies. Of two cones azimuths go together along a
@@ -20,11 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 import layerjax as lj
-from fits.data.geometry import TANGENT_COSINE
+from fits.data.geometry import TANGENT_COSINE, Floats
 from fits.problem.parameters import is_free
 from layerjax.mixture import stacks_of
 
-Floats = NDArray[np.float64]
 Counts = tuple[int, int, int]
 
 MOST_RINGS = 8
@@ -118,21 +116,16 @@ def _narrowest(material: lj.Stack | lj.Mixture) -> tuple[float, float]:
     for stack in stacks_of(material):
         for part in (*stack.layers, stack.base):
             if isinstance(part, lj.Interface | lj.Conductor):
-                facets.append(_least(part.alpha))
+                least = part.alpha.arrays()[1] if is_free(part.alpha) else np.asarray(part.alpha)
+                facets.append(float(np.min(least)))
             elif isinstance(part, lj.Medium | lj.TurbidMedium):
-                for phase in (_at(part.phase, end) for end in (1, 2)):
+                for end in (1, 2):  # at the lower bounds of what is free, and at the upper
+                    phase = jax.tree.map(
+                        lambda x, end=end: x.arrays()[end] if is_free(x) else x, part.phase, is_leaf=is_free
+                    )
                     upright = isinstance(phase, lj.SGGX) and phase.kind == "surface" and phase.is_upright
                     (facets if upright else others).append(float(np.min(phase.width)))
     return min(facets), min(others)
-
-
-def _least(alpha: Any) -> float:
-    return float(np.min(alpha.arrays()[1] if is_free(alpha) else np.asarray(alpha)))
-
-
-def _at(phase: lj.PhaseFunction, end: int) -> lj.PhaseFunction:
-    """A stack with free parameters at their lower (1) or upper (2) bounds."""
-    return jax.tree.map(lambda leaf: leaf.arrays()[end] if is_free(leaf) else leaf, phase, is_leaf=is_free)
 
 
 class Rays(NamedTuple):

@@ -1,12 +1,12 @@
 """One compiled program for every model of the same structure and shape: numbers are traced, the rest is its key."""
 
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from functools import cache
 from threading import Lock
-from typing import Any
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
@@ -16,6 +16,9 @@ from threadpoolctl import OpenBLASController, ThreadpoolController
 
 from layerjax._numerics import broadcasting
 from layerjax.compiling import compiler_options, is_outermost
+
+T = TypeVar("T")
+U = TypeVar("U")
 
 FULL = 0.5
 """Share of the maps that a process may have."""
@@ -128,6 +131,11 @@ def _threads() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(cores())
 
 
+def on_all_cores(call: Callable[[T], U], items: Iterable[T]) -> list[U]:
+    """What `call` gives of each, whose programs are compiled."""
+    return list(_threads().map(broadcasting(call), items))
+
+
 def in_shares(
     call: Callable[[NDArray[Any]], Any], rows: NDArray[Any], share: int, compiled: bool = False
 ) -> list[NDArray[Any]]:
@@ -143,5 +151,5 @@ def in_shares(
 
     firsts = range(0, len(rows), share)
     alone = 0 if compiled else 1
-    parts = [*map(of, firsts[:alone]), *_threads().map(broadcasting(of), firsts[alone:])]
+    parts = [*map(of, firsts[:alone]), *on_all_cores(of, firsts[alone:])]
     return [np.concatenate(results) for results in zip(*parts, strict=True)]

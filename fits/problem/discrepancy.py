@@ -22,7 +22,7 @@ the change of that covariance between white numbers; with c = B^-1 A'z,
 and C^-1 (B - 1) = C' - C^-1. So a Jacobian by many parameters makes matrices for those few of the process alone.
 """
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -33,10 +33,9 @@ from jax import Array
 from jax.scipy.linalg import solve_triangular
 from numpy.typing import ArrayLike, NDArray
 
-from fits.problem.parameters import Free, LogNormal, Normal
-from layerjax._checks import in_short
+from fits.data.geometry import Floats
+from fits.problem.parameters import Free, LogNormal, Normal, require_number_or_free
 
-Floats = NDArray[np.float64]
 Trio = tuple[Array, Array, Array]
 
 LONGEST = 40.0
@@ -105,22 +104,9 @@ class Discrepancy:
     channel_correlation: float | Free | None = None
 
     def __post_init__(self) -> None:
-        for entry in fields(self):
-            low, high = RANGES.get(entry.name, ANGLES)
-            value = getattr(self, entry.name)
-            if isinstance(value, Free):
-                if value.shape != ():
-                    raise ValueError(
-                        f"Noise.discrepancy.{entry.name} has {value.shape[0]} channels; it must be a single number"
-                    )
-                ends = {f"{entry.name}.{end}": getattr(value, end) for end in ("low", "high")}
-            else:
-                ends = {} if value is None else {entry.name: value}
-            for name, number in ends.items():
-                if not (isinstance(number, int | float) and low <= number <= high):
-                    raise ValueError(
-                        f"Noise.discrepancy.{name} is {in_short(number)}; it must be a number in [{low:g}, {high:g}]"
-                    )
+        for name, value in vars(self).items():
+            if value is not None:
+                require_number_or_free(f"Noise.discrepancy.{name}", value, *RANGES.get(name, ANGLES))
 
 
 def numbers_of(discrepancy: Discrepancy, shortest: Floats, channels: int) -> Correlation:
@@ -340,13 +326,17 @@ def _gram(weights: Array, relative: Array) -> Array:
     return jnp.stack([weights.T @ (column[:, None] ** 2 * weights) for column in relative.T])
 
 
-def _unit_square(roots: Roots, gram: Array) -> Array:
-    """A'A at an amplitude of 1, (C R, C R)."""
+def _roots_and_square(
+    numbers: Array, where: Array, weights: Array, gram: Array | None, relative: Array
+) -> tuple[Roots, Array]:
+    """The roots of a process, and A'A at an amplitude of 1, (C R, C R)."""
+    roots = _roots_of(numbers, where, relative.shape[-1])
+    gram = _gram(weights, relative) if gram is None else gram
     square = jnp.einsum("ri,crs,sj->cij", roots.inducing_points, gram, roots.inducing_points)
     if len(square) == 1:
-        return roots.channels[0, 0] ** 2 * square[0]
+        return roots, roots.channels[0, 0] ** 2 * square[0]
     size = square.shape[0] * square.shape[1]
-    return jnp.einsum("cx,cy,cij->xiyj", roots.channels, roots.channels, square).reshape(size, size)
+    return roots, jnp.einsum("cx,cy,cij->xiyj", roots.channels, roots.channels, square).reshape(size, size)
 
 
 def _root_of(amplitude: Array, square: Array) -> Array:
@@ -366,8 +356,7 @@ def _whitened(numbers: Array, where: Array, weights: Array, gram: Array | None, 
     Inducing points, weights (N, R) and a `gram` (C, R, R) that is given do not depend on parameters, nor does
     `relative` (N, C) with it.
     """
-    roots = _roots_of(numbers, where, z.shape[-1])
-    square = _unit_square(roots, _gram(weights, relative) if gram is None else gram)
+    roots, square = _roots_and_square(numbers, where, weights, gram, relative)
     root, amplitude = _root_of(numbers[0], square), numbers[0]
     half = solve_triangular(root, amplitude * _from_points(roots, (weights.T @ (relative * z)).T), lower=True)
     white = solve_triangular(root, half, lower=True, trans=1)
@@ -379,8 +368,7 @@ def _whitened(numbers: Array, where: Array, weights: Array, gram: Array | None, 
 def _(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[Trio, Trio]:
     numbers, where, weights, gram, z, relative = primals
     by_numbers, _, _, _, by_z, by_relative = tangents
-    amplitude, roots = numbers[0], _roots_of(numbers, where, z.shape[-1])
-    square = _unit_square(roots, _gram(weights, relative) if gram is None else gram)
+    amplitude, (roots, square) = numbers[0], _roots_and_square(numbers, where, weights, gram, relative)
     root = _root_of(amplitude, square)
     inverse = _triangular_inverse(root)
 
@@ -474,9 +462,8 @@ class Process(eqx.Module):
         smaller than 1, and negatively correlated between neighbours. Leave-one-out residuals (`leave_one_out`) have
         variance 1, but are correlated, too.
         """
-        gram = self.gram_of(relative) if self.gram is None else self.gram
-        roots = _roots_of(_vector_of(at, z.shape[-1]), self.where, z.shape[-1])
-        spread, axes = jnp.linalg.eigh(at.amplitude**2 * _unit_square(roots, gram))  # of A'A
+        roots, square = self._roots_and_square(relative, at)
+        spread, axes = jnp.linalg.eigh(at.amplitude**2 * square)  # of A'A
         root = jnp.sqrt(1.0 + jnp.maximum(spread, 0.0))
         explained = at.amplitude * _from_points(roots, (self.weights.T @ (relative * z)).T)
         white = -(axes @ ((axes.T @ explained) / (root * (1.0 + root))))  # ((1 + s)^-1/2 - 1) / s
@@ -529,10 +516,11 @@ class Process(eqx.Module):
 
     def _factors(self, relative: Array, at: Correlation) -> tuple[Roots, Array]:
         """Roots of the covariances, and of B."""
-        gram = self.gram_of(relative) if self.gram is None else self.gram
-        numbers = _vector_of(at, relative.shape[-1])
-        roots = _roots_of(numbers, self.where, relative.shape[-1])
-        return roots, _root_of(numbers[0], _unit_square(roots, gram))
+        roots, square = self._roots_and_square(relative, at)
+        return roots, _root_of(jnp.asarray(at.amplitude, float), square)
+
+    def _roots_and_square(self, relative: Array, at: Correlation) -> tuple[Roots, Array]:
+        return _roots_and_square(_vector_of(at, relative.shape[-1]), self.where, self.weights, self.gram, relative)
 
 
 def make_process(wi: ArrayLike, wo: ArrayLike, channels: int = 1) -> Process:

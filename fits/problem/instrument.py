@@ -14,14 +14,12 @@ import numpy as np
 from jax import Array
 from numpy.typing import NDArray
 
-from fits.data.geometry import AT_NORMAL, LIGHT_AZIMUTH, polar
+from fits.data.geometry import AT_NORMAL, LIGHT_AZIMUTH, Floats, polar
 from fits.data.scans import SAME_ANGLE
 from fits.problem.apertures import MOST_RINGS, Spread, ray_counts, rays, spread_over_lobes
-from fits.problem.parameters import Free, LogNormal
-from layerjax._checks import in_short
+from fits.problem.parameters import Free, LogNormal, require_number_or_free
+from layerjax._checks import require_count, require_number
 from layerjax.transport.known_directions import KnownDirections, known_directions
-
-Floats = NDArray[np.float64]
 
 WIDEST, MOST_TILT, GAIN_SPREADS = 30.0, 10.0, (1e-4, 1.0)
 """Degrees of a cone, degrees that a sample may be tilted, and relative standard deviations of gains."""
@@ -56,24 +54,14 @@ class Instrument:
     rings: int | None = None
 
     def __post_init__(self) -> None:
-        for name in ("source_aperture", "detector_aperture"):
-            _require(name, getattr(self, name), 0.0, WIDEST)
-        if isinstance(self.tilt, Free):
-            if self.tilt.shape != ():
-                raise ValueError("Instrument.tilt has channels; it must be a single number")
-            for end in ("low", "high"):
-                _require(f"tilt.{end}", getattr(self.tilt, end), -MOST_TILT, MOST_TILT)
-        elif self.tilt is not None:
-            _require("tilt", self.tilt, -MOST_TILT, MOST_TILT)
+        require_number("Instrument.source_aperture", self.source_aperture, 0.0, WIDEST)
+        require_number("Instrument.detector_aperture", self.detector_aperture, 0.0, WIDEST)
+        if self.tilt is not None:
+            require_number_or_free("Instrument.tilt", self.tilt, -MOST_TILT, MOST_TILT)
         if self.gain_sd is not None:
-            _require("gain_sd", self.gain_sd, *GAIN_SPREADS)
-        if self.rings is not None and not (type(self.rings) is int and 1 <= self.rings <= MOST_RINGS):
-            raise ValueError(f"Instrument.rings is {in_short(self.rings)}; it must be an integer in [1, {MOST_RINGS}]")
-
-    @property
-    def has_cones(self) -> bool:
-        """Whether there is anything to take the mean over."""
-        return self.source_aperture > 0.0 or self.detector_aperture > 0.0
+            require_number("Instrument.gain_sd", self.gain_sd, *GAIN_SPREADS)
+        if self.rings is not None:
+            require_count("Instrument.rings", self.rings, 1, MOST_RINGS)
 
 
 class Setting(NamedTuple):
@@ -145,8 +133,8 @@ def optics_of(
         wi, wo = (np.asarray(_tilted(w, _forward(wi), tilt), float) for w in (wi, wo))
     most = float(np.max(np.abs(tilt.arrays()[1:]))) if isinstance(tilt, Free) else 0.0
     pairs, row, share = (wi, wo), None, None
-    if instrument.has_cones:
-        widths = instrument.source_aperture, instrument.detector_aperture
+    widths = instrument.source_aperture, instrument.detector_aperture
+    if any(widths):
         spread = spread_over_lobes(*widths, stack, wi, wo, most, instrument.rings)
         if spread.matters.any():
             pairs, row, share = _cones(instrument, wi, wo, spread, other)
@@ -223,15 +211,10 @@ def _over_disc(w: Floats, radius: float, disc: Floats) -> Floats:
     cosine = 1.0 - (1.0 - math.cos(radius)) * square
     sine = np.sqrt((1.0 - cosine) * (1.0 + cosine))
     across = disc * (sine / np.where(square > 0.0, np.sqrt(square), 1.0))[:, None]
-    first, second = _across(w)
-    return cosine[:, None, None] * w + across[:, :1, None] * first + across[:, 1:, None] * second
-
-
-def _across(w: Floats) -> tuple[Floats, Floats]:
-    """Unit vectors across w (M, 3): in its plane with the normal, and along the horizon; both turn with the azimuth."""
+    # unit vectors across w, along the horizon and in its plane with the normal: both turn with the azimuth
     forward = _horizontal(w)
     along = np.stack([-forward[:, 1], forward[:, 0], np.zeros(len(w))], axis=-1)
-    return np.cross(along, w), along
+    return cosine[:, None, None] * w + across[:, :1, None] * np.cross(along, w) + across[:, 1:, None] * along
 
 
 def _horizontal(w: Floats) -> Floats:
@@ -256,9 +239,3 @@ def _tilted(w: Any, forward: Any, offset: Any) -> Array:
     turned = along * cosine - w[:, 2] * sine
     flat = w[:, :2] + (turned - along)[:, None] * forward
     return jnp.concatenate([flat, (along * sine + w[:, 2] * cosine)[:, None]], axis=-1)
-
-
-def _require(name: str, value: Any, low: float, high: float) -> None:
-    number = isinstance(value, int | float) and not isinstance(value, bool)
-    if not (number and low <= value <= high):
-        raise ValueError(f"Instrument.{name} is {in_short(value)}; it must be a number in [{low:g}, {high:g}]")

@@ -1,11 +1,10 @@
 """What a vector of parameters predicts, and how far that is from the data: pure functions that compile once.
 
-A `Density` holds a problem as arrays and static choices, so that one compiled program serves every problem of the same
+A model holds a problem as arrays and static choices, so that one compiled program serves every problem of the same
 structure and shape: new data, bounds or fixed numbers do not recompile. `Model` is that of one data set, `JointModel`
 that of several.
 """
 
-import abc
 import math
 from collections.abc import Callable, Sequence
 from typing import Any, Literal, NamedTuple, cast
@@ -61,98 +60,10 @@ class Parts(NamedTuple):
     correlation: Correlation | None
 
 
-class Density(eqx.Module):
-    """Pure functions of the physical vector (P,): predictions, residuals and log-densities over all measurements.
+class Model(eqx.Module):
+    """Pure functions of the physical vector (P,): predictions, residuals and log-densities of one data set.
 
     What ends with `_at` takes what the vector predicts, (N, C), beside it, so that nothing is computed twice.
-
-    Attributes:
-        box: bounds and priors of the P parameters.
-        varying: whether sigma depends on the parameters.
-    """
-
-    box: eqx.AbstractVar[Box]
-    varying: eqx.AbstractVar[bool]
-
-    @property
-    @abc.abstractmethod
-    def logarithmic(self) -> tuple[int, ...]:
-        """Places, among `residuals`, of those whose half squares are logarithms of levels of noise."""
-
-    @abc.abstractmethod
-    def predict(self, vector: Array) -> Array:
-        """Scaled BSDF, (N, C), in 1/sr."""
-
-    @abc.abstractmethod
-    def initial_sigma(self, vector: Array) -> Array:
-        """A scale of the noise, (N, C), in 1/sr, by which no measurement near 0 stands out: a fit begins with it."""
-
-    @abc.abstractmethod
-    def whitened_residuals_at(self, vector: Array, predicted: Array) -> Array:
-        """`Model.offsets_at` by the root of their covariance: under the assumed model independent, with variance 1."""
-
-    @abc.abstractmethod
-    def chi_square_at(self, vector: Array, predicted: Array) -> Array:
-        """z'S^-1 z of `Model.offsets_at` z, with S their covariance: 1 without model discrepancy."""
-
-    @abc.abstractmethod
-    def log_likelihood_per_datum_at(self, vector: Array, predicted: Array) -> Array:
-        """Normalised log-density of each datum, (N, C); with model discrepancy, given all others."""
-
-    @abc.abstractmethod
-    def log_likelihood_at(self, vector: Array, predicted: Array) -> Array:
-        """Normalised log-likelihood of all data."""
-
-    @abc.abstractmethod
-    def residuals_at(self, vector: Array, predicted: Array) -> tuple[Array, ...]:
-        """Arrays whose half sum of squares is minus the log-posterior up to a constant, or the named objective.
-
-        The first of them is of the data, the second of the prior, those that are left of levels of noise (see
-        `logarithmic`).
-        """
-
-    @abc.abstractmethod
-    def linear_parts(
-        self, vector: Array, first_step: tuple[Array, Array] | None = None
-    ) -> tuple[tuple[Array, ...], tuple[Array, Array]]:
-        """`residuals`; and what is predicted, (N, C), with the rows (rows,) of the data's Fisher information.
-
-        The Jacobian A of these rows has the Fisher information A'A. The expected information needs first derivatives
-        only and is never indefinite; for Gaussian noise that is known it is J'J. For a named objective: its residuals.
-
-        first_step: towards a fit of levels of noise, a scale of it, (N, C), in the place of sigma where it is finite,
-        and how much of the model discrepancy counts.
-        """
-
-    def residuals(self, vector: Array) -> tuple[Array, ...]:
-        """`residuals_at` what these parameters predict."""
-        return self.linear_parts(vector)[0]
-
-    def cost_at(self, vector: Array, predicted: Array) -> Array:
-        """Half the sum of squared residuals."""
-        return half_squares(self.residuals_at(vector, predicted))
-
-    def log_likelihood_per_datum(self, vector: Array) -> Array:
-        """`log_likelihood_per_datum_at` what these parameters predict."""
-        return self.log_likelihood_per_datum_at(vector, self.predict(vector))
-
-    def log_likelihood(self, vector: Array) -> Array:
-        """Normalised log-likelihood of all data."""
-        return self.log_likelihood_at(vector, self.predict(vector))
-
-    def log_prior(self, vector: Array) -> Array:
-        """Log-density of the physical vector, -inf outside the bounds."""
-        return self.box.log_prior(vector)
-
-    def log_posterior_unconstrained(self, u: Array) -> Array:
-        """Log-posterior (not normalised) as a density over the unconstrained vector; -inf where undefined."""
-        vector = self.box.constrain(u)
-        total = self.log_likelihood(vector) + self.box.log_prior(vector) + self.box.log_determinant(u)
-        return jnp.where(jnp.isfinite(total), total, -jnp.inf)
-
-
-class Model(Density):
-    """The density of one data set: see `Density`.
 
     Attributes:
         template: the stack, scale and noise levels without their free parameters.
@@ -191,6 +102,37 @@ class Model(Density):
     tails: Tails = eqx.field(static=True)
     varying: bool = eqx.field(static=True)
     moving: int = eqx.field(static=True)
+
+    def residuals(self, vector: Array) -> tuple[Array, ...]:
+        """`residuals_at` what these parameters predict."""
+        return self.linear_parts(vector)[0]
+
+    def cost_at(self, vector: Array, predicted: Array) -> Array:
+        """Half the sum of squared residuals."""
+        return 0.5 * jnp.sum(jnp.stack([jnp.sum(part**2) for part in self.residuals_at(vector, predicted)]))
+
+    def log_likelihood_per_datum(self, vector: Array) -> Array:
+        """`log_likelihood_per_datum_at` what these parameters predict."""
+        return self.log_likelihood_per_datum_at(vector, self.predict(vector))
+
+    def log_likelihood(self, vector: Array) -> Array:
+        """Normalised log-likelihood of all data."""
+        return self.log_likelihood_at(vector, self.predict(vector))
+
+    def log_prior(self, vector: Array) -> Array:
+        """Log-density of the physical vector, -inf outside the bounds."""
+        return self.box.log_prior(vector)
+
+    def log_posterior_unconstrained(self, u: Array) -> Array:
+        """Log-posterior (not normalised) as a density over the unconstrained vector; -inf where undefined."""
+        vector = self.box.constrain(u)
+        total = self.log_likelihood(vector) + self.box.log_prior(vector) + self.box.log_determinant(u)
+        return jnp.where(jnp.isfinite(total), total, -jnp.inf)
+
+    @property
+    def places(self) -> tuple[tuple[int, ...], ...]:
+        """Of the parameters of the one data set: all of them."""
+        return (tuple(range(len(self.box.low))),)
 
     def build(self, vector: Array) -> Parts:
         """Stack, scale and noise levels with these parameters."""
@@ -233,14 +175,14 @@ class Model(Density):
         return -self.whitened_at(vector, predicted, self._noise_at(vector, predicted)).residuals
 
     def whitened_residuals_at(self, vector: Array, predicted: Array) -> Array:
-        """See `Density`."""
+        """`offsets_at` by the root of their covariance: under the assumed model independent, with variance 1."""
         if self.process is None:
             return self.standardised_at(vector, predicted)
         scaled = self._logarithmic(predicted, self._noise_at(vector, predicted))
         return -self.process.whitened_residuals(*scaled, self._correlation(vector))
 
     def chi_square_at(self, vector: Array, predicted: Array) -> Array:
-        """See `Density`."""
+        """z'S^-1 z of `offsets_at` z, with S their covariance: 1 without model discrepancy."""
         if self.process is None:
             return jnp.sum(self.standardised_at(vector, predicted) ** 2)
         found = self.whitened_at(vector, predicted, self._noise_at(vector, predicted))
@@ -263,15 +205,19 @@ class Model(Density):
 
     @property
     def logarithmic(self) -> tuple[int, ...]:
-        """See `Density`."""
+        """Places, among `residuals`, of those whose half squares are logarithms of levels of noise."""
         return tuple(range(2, 2 + self.varying + (self.process is not None)))
 
     def residuals_at(self, vector: Array, predicted: Array) -> tuple[Array, ...]:
-        """See `Density`."""
+        """Arrays whose half sum of squares is minus the log-posterior up to a constant, or the named objective.
+
+        The first of them is of the data, the second of the prior, those that are left of levels of noise (see
+        `logarithmic`).
+        """
         return self._residuals(vector, predicted, self._noise_at(vector, predicted))
 
     def initial_sigma(self, vector: Array) -> Array:
-        """See `Density`."""
+        """A scale of the noise, (N, C), in 1/sr, by which no measurement near 0 stands out: a fit begins with it."""
         parts = self.build(vector)
         typical = jnp.mean(jnp.abs(self.values))  # a tenth of it keeps data near 0 from outweighing all others
         return total_sigma(jnp.abs(self.values) + 0.1 * typical, self.variance, parts.relative, parts.floor)
@@ -279,7 +225,15 @@ class Model(Density):
     def linear_parts(
         self, vector: Array, first_step: tuple[Array, Array] | None = None, others: bool = False
     ) -> tuple[tuple[Array, ...], tuple[Array, Array]]:
-        """See `Density`. others: whether derivatives are also by parameters that nothing depends on here."""
+        """`residuals`; and what is predicted, (N, C), with the rows (rows,) of the data's Fisher information.
+
+        The Jacobian A of these rows has the Fisher information A'A. The expected information needs first derivatives
+        only and is never indefinite; for Gaussian noise that is known it is J'J. For a named objective: its residuals.
+
+        first_step: towards a fit of levels of noise, a scale of it, (N, C), in the place of sigma where it is finite,
+        and how much of the model discrepancy counts. others: whether derivatives are also by parameters that nothing
+        depends on here.
+        """
         alone = self.moving == vector.size and not others
         predicted = self.predict(vector) if alone else _by_columns(vector, model=self)
         sigma = self._noise_at(vector, predicted)
@@ -292,7 +246,7 @@ class Model(Density):
         return self._residuals(vector, predicted, held, shared), (predicted, rows)
 
     def log_likelihood_per_datum_at(self, vector: Array, predicted: Array) -> Array:
-        """See `Density`."""
+        """Normalised log-density of each datum, (N, C); with model discrepancy, given all others."""
         sigma = self._noise_at(vector, predicted)
         if self.process is None:
             z = (self.values - predicted) / sigma
@@ -304,7 +258,7 @@ class Model(Density):
         return log_density(own / jnp.sqrt(precision), width, self.tails, self.degrees_of_freedom)
 
     def log_likelihood_at(self, vector: Array, predicted: Array) -> Array:
-        """See `Density`."""
+        """Normalised log-likelihood of all data."""
         if self.process is None:
             return jnp.sum(self.log_likelihood_per_datum_at(vector, predicted))
         sigma = self._noise_at(vector, predicted)
@@ -376,8 +330,8 @@ def _(primals: tuple[Array], tangents: tuple[Array], *, model: Model) -> tuple[A
     return value, columns @ moved[: model.moving]
 
 
-class JointModel(Density):
-    """The density of several data sets, one after the other, (N, 1): the product of theirs.
+class JointModel(eqx.Module):
+    """Of several data sets, one after the other, (N, 1), the same functions as of one: the product of their densities.
 
     Attributes:
         parts: the densities of the data sets.
@@ -388,6 +342,10 @@ class JointModel(Density):
     box: Box
     places: tuple[tuple[int, ...], ...] = eqx.field(static=True)
     varying: bool = eqx.field(static=True)
+
+    residuals, cost_at, log_prior = Model.residuals, Model.cost_at, Model.log_prior
+    log_likelihood, log_likelihood_per_datum = Model.log_likelihood, Model.log_likelihood_per_datum
+    log_posterior_unconstrained = Model.log_posterior_unconstrained
 
     @property
     def objective(self) -> Objective:
@@ -401,41 +359,33 @@ class JointModel(Density):
 
     @property
     def logarithmic(self) -> tuple[int, ...]:
-        """See `Density`."""
         return (2,) if any(part.logarithmic for part in self.parts) else ()
 
     def predict(self, vector: Array) -> Array:
-        """See `Density`."""
         return _column([part.predict(own) for part, own in self._with_vectors(vector)])
 
     def initial_sigma(self, vector: Array) -> Array:
-        """See `Density`."""
         return _column([part.initial_sigma(own) for part, own in self._with_vectors(vector)])
 
     def whitened_residuals_at(self, vector: Array, predicted: Array) -> Array:
-        """See `Density`."""
         return _column(self._each(Model.whitened_residuals_at, vector, predicted))
 
     def log_likelihood_per_datum_at(self, vector: Array, predicted: Array) -> Array:
-        """See `Density`."""
         return _column(self._each(Model.log_likelihood_per_datum_at, vector, predicted))
 
     def chi_square_at(self, vector: Array, predicted: Array) -> Array:
-        """See `Density`."""
         return jnp.sum(jnp.stack(self._each(Model.chi_square_at, vector, predicted)))
 
     def log_likelihood_at(self, vector: Array, predicted: Array) -> Array:
-        """See `Density`."""
         return jnp.sum(jnp.stack(self._each(Model.log_likelihood_at, vector, predicted)))
 
     def residuals_at(self, vector: Array, predicted: Array) -> tuple[Array, ...]:
-        """See `Density`."""
         return self._together(vector, self._each(Model.residuals_at, vector, predicted))
 
     def linear_parts(
         self, vector: Array, first_step: tuple[Array, Array] | None = None
     ) -> tuple[tuple[Array, ...], tuple[Array, Array]]:
-        """See `Density`; each data set is differentiated by its own parameters alone."""
+        """Each data set is differentiated by its own parameters alone."""
         steps: list[tuple[Array, Array] | None] = [None] * len(self.parts)
         if first_step is not None:
             held, shared = first_step
@@ -469,11 +419,6 @@ class JointModel(Density):
 
 def _column(parts: Sequence[Array]) -> Array:
     return jnp.concatenate([part.reshape(-1) for part in parts])[:, None]
-
-
-def half_squares(residuals: tuple[Array, ...]) -> Array:
-    """Half the sum of the squares of all residuals: the cost that a fit minimises."""
-    return 0.5 * jnp.sum(jnp.stack([jnp.sum(part**2) for part in residuals]))
 
 
 def forward(

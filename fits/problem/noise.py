@@ -11,20 +11,21 @@ constant, so that a least-squares solver maximises the likelihood exactly:
 
 import math
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple, get_args
+from numbers import Real
+from typing import Literal, NamedTuple, get_args
 
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jax.scipy.special import gammaln
-from numpy.typing import NDArray
 
 from fits._files import require_switch
+from fits.data.geometry import Floats
 from fits.data.measurements import LARGEST, Measurements
 from fits.names import Objective
 from fits.problem.discrepancy import Discrepancy, Process, size, softness
-from fits.problem.parameters import Free, is_free
-from layerjax._checks import in_short
+from fits.problem.parameters import Free, is_free, require_number_or_free
+from layerjax._checks import in_short, require_choice, require_number
 
 Tails = Literal["gaussian", "student"]
 DEFAULT_RELATIVE = 0.05
@@ -60,19 +61,13 @@ class Noise:
     discrepancy: Discrepancy | bool | None = None
 
     def __post_init__(self) -> None:
-        for field, (least, most) in (("relative", (0.0, 1.0)), ("floor", LEVELS)):
-            level = getattr(self, field)
-            if isinstance(level, Free):
-                if level.shape != ():
-                    raise ValueError(f"Noise.{field} has {level.shape[0]} channels; it must be a single number")
-                for end, value in zip(("low", "high"), level.arrays()[1:], strict=True):
-                    _check_range(f"{field}.{end}", float(value), least, most)
-            elif level is not None and not (isinstance(level, int | float) and level == 0):
-                _check_range(field, level, least, most)
+        if self.relative is not None:
+            require_number_or_free("Noise.relative", self.relative, 0.0, 1.0)
+        if self.floor is not None and not (isinstance(self.floor, Real) and self.floor == 0.0):
+            require_number_or_free("Noise.floor", self.floor, *LEVELS)
         require_switch("Noise.use_sigma", self.use_sigma)
-        if self.tails not in get_args(Tails):
-            raise ValueError(f"Noise.tails is {self.tails!r}; it must be one of {', '.join(get_args(Tails))}")
-        _check_range("degrees_of_freedom", self.degrees_of_freedom, *DEGREES_OF_FREEDOM)
+        require_choice("Noise.tails", self.tails, get_args(Tails))
+        require_number("Noise.degrees_of_freedom", self.degrees_of_freedom, *DEGREES_OF_FREEDOM)
         if self.discrepancy is True:
             object.__setattr__(self, "discrepancy", Discrepancy())
         if not (self.discrepancy in (False, None) or isinstance(self.discrepancy, Discrepancy)):
@@ -81,12 +76,6 @@ class Noise:
             )
         if self.discrepancy and self.tails != "gaussian":
             raise ValueError(f"Noise.tails is {self.tails!r}; with model discrepancy it must be gaussian")
-
-
-def _check_range(field: str, value: Any, low: float, high: float) -> None:
-    if not (isinstance(value, int | float) and low <= value <= high):
-        share = " (0.05 is 5 %)" if field.startswith("relative") else ""
-        raise ValueError(f"Noise.{field} is {in_short(value)}; it must be a number in [{low:g}, {high:g}]{share}")
 
 
 def total_sigma(predicted: Array, variance: Array, relative: Array, floor: Array) -> Array:
@@ -152,9 +141,6 @@ def _log1p_ratio(x: Array) -> Array:
     return jnp.where(small, series, jnp.log1p(tame) / tame)
 
 
-Floats = NDArray[np.float64]
-
-
 class Levels(NamedTuple):
     """Noise of the used samples: the measurement's own variance, (N, C) or (1,), and the levels of the noise model."""
 
@@ -167,7 +153,8 @@ class Levels(NamedTuple):
     @property
     def smallest(self) -> Floats:
         """What sigma cannot fall below, (N, C) or (1,), in 1/sr."""
-        return np.sqrt(self.variance + _lowest(self.floor) ** 2)
+        floor = self.floor.low if isinstance(self.floor, Free) else self.floor
+        return np.sqrt(self.variance + np.square(floor))
 
     @property
     def fitted(self) -> bool:
@@ -181,7 +168,8 @@ class Levels(NamedTuple):
 
     def softness(self, values: Floats) -> Floats:
         """The softness of the logarithms of measurements (N, C), see `fits.problem.discrepancy`."""
-        return softness(values, np.sqrt(self.variance + _start(self.floor) ** 2))
+        floor = self.floor.start if isinstance(self.floor, Free) else self.floor
+        return softness(values, np.sqrt(self.variance + np.square(floor)))
 
     def gram(self, process: Process, values: Floats) -> Array | None:
         """What measurements (N, C) tell of a process of the discrepancy; None where it depends on parameters."""
@@ -211,20 +199,12 @@ def noise_levels(noise: Noise, used: Measurements) -> Levels:
 
 def require_size(levels: Levels) -> None:
     """Refuse values of which a share has a square that vanishes or overflows."""
-    if not levels.floor_is_share or is_free(levels.floor) or levels.floor == 0:
+    if not levels.floor_is_share or isinstance(levels.floor, Free) or levels.floor == 0:
         return
-    precision, median = jnp.finfo(jnp.result_type(float)), _start(levels.floor) / DEFAULT_FLOOR
+    precision, median = jnp.finfo(jnp.result_type(float)), levels.floor / DEFAULT_FLOOR
     least, most = max(LEVELS[0], math.sqrt(precision.tiny)) / DEFAULT_FLOOR, min(LARGEST, math.sqrt(precision.max))
     if not least <= median <= most:
         raise ValueError(
             f"values: the median of |value| is {median:.3g} 1/sr; for noise relative to them it must be in "
             f"[{least:.2g}, {most:.2g}], or Noise.floor be given"
         )
-
-
-def _lowest(level: float | Free) -> float:
-    return float(level.arrays()[1]) if isinstance(level, Free) else float(level)
-
-
-def _start(level: float | Free) -> float:
-    return float(level.arrays()[0]) if isinstance(level, Free) else float(level)

@@ -8,11 +8,10 @@ Three spaces, all of dimension P:
 - *unconstrained* `u = log(s / (1 - s))`: samplers work here, with the log-determinant of the map.
 """
 
-import dataclasses
-import inspect
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import product
 from typing import Any, ClassVar, cast
 
 import equinox as eqx
@@ -20,17 +19,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from numpy.typing import NDArray
 from scipy import stats
 
 import layerjax as lj
 from fits._files import require_switch
-from layerjax._checks import in_short
-from layerjax._parameters import PER_CHANNEL
+from fits.data.geometry import Floats
+from layerjax._checks import in_short, require_kind, require_number
 from layerjax._shown import Shown
 from layerjax.mixture import stacks_by_name
-
-Floats = NDArray[np.float64]
 
 FARTHEST_MEAN = 37.0  # standard deviations from the bounds; farther out the density within them underflows in float64
 NARROWEST = 1e-15  # standard deviation, as a share of the distances in the box: below, float64 has no numbers for it
@@ -71,8 +67,8 @@ class Normal(Prior):
     sd: float
 
     def __post_init__(self) -> None:
-        _require_finite("Normal.mean", self.mean)
-        _require_finite("Normal.sd", self.sd, above=0.0)
+        require_number("Normal.mean", self.mean, open_ends=True)
+        require_number("Normal.sd", self.sd, 0.0, open_ends=True)
 
     def gaussian(self) -> tuple[float, float]:
         """Centre and inverse standard deviation."""
@@ -88,22 +84,12 @@ class LogNormal(Prior):
     logarithmic: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
-        _require_finite("LogNormal.median", self.median, above=0.0)
-        _require_finite("LogNormal.sd", self.sd, above=0.0)
+        require_number("LogNormal.median", self.median, 0.0, open_ends=True)
+        require_number("LogNormal.sd", self.sd, 0.0, open_ends=True)
 
     def gaussian(self) -> tuple[float, float]:
         """Centre and inverse standard deviation of the logarithm."""
         return math.log(self.median), 1.0 / float(self.sd)
-
-
-def _require_finite(field: str, value: Any, above: float = -math.inf) -> None:
-    try:
-        allowed = math.isfinite(value) and value > above
-    except (TypeError, OverflowError):  # no number, or several of them
-        allowed = False
-    if not allowed:
-        least = "" if math.isinf(above) else f" and above {above:g}"
-        raise ValueError(f"{field} is {in_short(value)}; it must be one number, finite{least}")
 
 
 def _require_computable(prior: Prior, low: Floats, high: Floats) -> None:
@@ -149,12 +135,6 @@ def _log_normaliser(prior: Prior, low: float, high: float) -> float:
     return log_mass - math.log(inverse_sd) + 0.5 * math.log(2 * math.pi)
 
 
-def _steps(random_walk_sd: Any, channels: int) -> Floats:
-    """Differences between neighbouring channels over their standard deviations, (channels - 1, channels)."""
-    inverse = 1.0 / np.broadcast_to(np.asarray(random_walk_sd, float), (channels - 1,))
-    return inverse[:, None] * np.diff(np.eye(channels), axis=0)
-
-
 def _random_walk_normaliser(prior: Prior, steps: Floats, normalisers: Floats) -> Floats:
     """Of channels (C,), by the normaliser of each and the steps between them: of all together, in the first.
 
@@ -194,35 +174,23 @@ class Free:
     material it says nothing.
     """
 
-    start: float | tuple[float, ...]
-    low: float | tuple[float, ...]
-    high: float | tuple[float, ...]
-    prior: Prior
-    random_walk_sd: float | tuple[float, ...] | None
+    start: float | Sequence[float]
+    low: float | Sequence[float]
+    high: float | Sequence[float]
+    prior: Prior = Uniform()
+    random_walk_sd: float | Sequence[float] | None = None
     same_for_all_texels: bool = False
 
     __layerjax_placeholder__: ClassVar[bool] = True
 
-    def __init__(
-        self,
-        start: float | Sequence[float],
-        low: float | Sequence[float],
-        high: float | Sequence[float],
-        prior: Prior | None = None,
-        random_walk_sd: float | Sequence[float] | None = None,
-        same_for_all_texels: bool = False,
-    ):
-        prior = Uniform() if prior is None else prior
-        if not isinstance(prior, Prior):
-            raise ValueError(
-                f"Free.prior is {in_short(prior)}; it must be Uniform, LogUniform, Normal, LogNormal or None"
-            )
-        require_switch("Free.same_for_all_texels", same_for_all_texels)
-        object.__setattr__(self, "prior", prior)
-        object.__setattr__(self, "same_for_all_texels", same_for_all_texels)
-        given = {"start": start, "low": low, "high": high, "random_walk_sd": random_walk_sd}
-        for field, value in given.items():
-            object.__setattr__(self, field, value if value is None else _plain(f"Free.{field}", value))
+    def __post_init__(self) -> None:
+        if self.prior is None:
+            object.__setattr__(self, "prior", Uniform())
+        require_kind("Free.prior", self.prior, Uniform, LogUniform, Normal, LogNormal)
+        require_switch("Free.same_for_all_texels", self.same_for_all_texels)
+        for field in ("start", "low", "high", "random_walk_sd"):
+            if (value := getattr(self, field)) is not None or field != "random_walk_sd":
+                object.__setattr__(self, field, _plain(f"Free.{field}", value))
         first, lower, upper = self.arrays()
         if np.any(lower >= upper):
             raise ValueError(
@@ -232,17 +200,9 @@ class Free:
             raise ValueError(
                 f"Free.start is {in_short(self.start)}; it must lie in [{in_short(self.low)}, {in_short(self.high)}]"
             )
-        _require_computable(prior, lower, upper)
-        if self.random_walk_sd is not None:
-            self._require_steps()
-
-    @property
-    def shape(self) -> tuple[int, ...]:
-        """() or (C,)."""
-        return self.arrays()[0].shape
-
-    def _require_steps(self) -> None:
-        """ValueError for standard deviations between neighbouring channels that are none."""
+        _require_computable(self.prior, lower, upper)
+        if self.random_walk_sd is None:
+            return
         steps, shape = np.asarray(self.random_walk_sd), self.shape
         if not shape or shape[0] < 2:
             raise ValueError(
@@ -254,6 +214,11 @@ class Free:
             )
         if not np.all(steps > 0.0):
             raise ValueError(f"Free.random_walk_sd is {in_short(steps.tolist())}; it must be above 0")
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """() or (C,)."""
+        return self.arrays()[0].shape
 
     def __repr__(self) -> str:
         words = [repr(value) for value in (self.start, self.low, self.high)]
@@ -291,6 +256,17 @@ def is_free(leaf: Any) -> bool:
     return isinstance(leaf, Free)
 
 
+def require_number_or_free(name: str, value: Any, low: float, high: float) -> None:
+    """Refuse what is neither a number in [low, high] nor a single `Free` with such bounds."""
+    if not is_free(value):
+        require_number(name, value, low, high)
+        return
+    if value.shape != ():
+        raise ValueError(f"{name} has {value.shape[0]} channels; it must be a single number")
+    require_number(f"{name}.low", value.low, low, high)
+    require_number(f"{name}.high", value.high, low, high)
+
+
 class PowerLaw(Shown):
     """A number a channel, ``amplitude (wavelength / reference)^-exponent``: in the place of one in a stack.
 
@@ -321,15 +297,10 @@ class PowerLaw(Shown):
         for name, values in (("wavelengths", given), ("reference", np.array([self.reference]))):
             if not np.all(np.isfinite(values) & (values > 0.0)):
                 raise ValueError(f"PowerLaw.{name} is {in_short(values.tolist())}; it must be finite and above 0")
-        ends = {"amplitude": amplitude, "exponent": exponent}
-        if not any(map(is_free, ends.values())):
+        require_number_or_free("PowerLaw.amplitude", amplitude, 0.0, math.inf)
+        require_number_or_free("PowerLaw.exponent", exponent, -math.inf, math.inf)
+        if not (is_free(amplitude) or is_free(exponent)):
             raise ValueError("PowerLaw: nothing is free; write the number of each channel instead")
-        for name, value in ends.items():
-            shape = value.shape if is_free(value) else np.shape(value)
-            if shape != ():
-                raise ValueError(f"PowerLaw.{name} has {shape[0]} channels; it must be one number")
-        if _ends(amplitude)[0] < 0.0:
-            raise ValueError(f"PowerLaw.amplitude reaches down to {_ends(amplitude)[0]:g}; it must be at least 0")
 
     def values(self) -> Array:
         """(C,), of numbers that are not free."""
@@ -339,7 +310,8 @@ class PowerLaw(Shown):
     def extremes(self) -> tuple[np.ndarray, np.ndarray]:
         """The least and the largest of each channel, (C,), within the bounds of what is free."""
         ratio = np.asarray(self.wavelengths) / self.reference
-        corners = np.array([a * ratio**-b for a in _ends(self.amplitude) for b in _ends(self.exponent)])
+        ends = ((one.low, one.high) if is_free(one) else (one,) for one in (self.amplitude, self.exponent))
+        corners = np.array([a * ratio**-b for a, b in product(*ends)])
         return corners.min(axis=0), corners.max(axis=0)
 
 
@@ -354,40 +326,16 @@ def with_values(tree: Any) -> Any:
 
 
 def require_in_range(material: Any) -> None:
-    """Refuse power laws where no number a channel stands, or that leave its range: ValueError that names the place."""
-    seen = 0
-    stacks = stacks_by_name(material) if isinstance(material, lj.Stack | lj.Mixture) else {}
-    for prefix, stack in stacks.items():
-        named = [(f"{prefix}layers[{place}]", layer) for place, layer in enumerate(stack.layers)]
-        for where, part in (*named, (f"{prefix}base", stack.base)):
-            for name, law in _laws(part):
-                seen += 1
-                for end in law.extremes():
-                    try:
-                        dataclasses.replace(cast(Any, part), **{name: end})
-                    except ValueError as error:
-                        raise ValueError(f"{where}: within the bounds of its power law {error}") from None
-    if seen < sum(map(is_law, jax.tree.leaves(material, is_leaf=is_law))):
-        raise ValueError("PowerLaw stands where no number a channel may; it may be in a layer or base of a stack")
-
-
-def _laws(part: Any) -> list[tuple[str, PowerLaw]]:
-    """Power laws of a layer or a base, in the place of numbers that may differ by channel."""
-    if not dataclasses.is_dataclass(part):
-        return []
-    kinds = [kind.__name__ for kind in inspect.getmro(type(part))]
-    named = [(field.name, getattr(part, field.name)) for field in dataclasses.fields(part)]
-    return [
-        (name, value)
-        for name, value in named
-        if is_law(value) and any(f"{kind}.{name}" in PER_CHANNEL for kind in kinds)
-    ]
-
-
-def _ends(value: Any) -> tuple[float, float]:
-    if isinstance(value, Free):
-        return float(value.arrays()[1]), float(value.arrays()[2])
-    return float(value), float(value)
+    """Refuse power laws that leave the range of the numbers in whose place they stand: ValueError that names it."""
+    for prefix, stack in stacks_by_name(material).items() if isinstance(material, lj.Stack | lj.Mixture) else ():
+        parts = {f"{prefix}layers[{place}]": layer for place, layer in enumerate(stack.layers)}
+        for where, part in (parts | {f"{prefix}base": stack.base}).items():
+            laws = {} if part is None else {name: one for name, one in vars(part).items() if is_law(one)}
+            for name, end in ((name, end) for name, law in laws.items() for end in law.extremes()):
+                try:
+                    replace(cast(Any, part), **{name: end})
+                except ValueError as error:
+                    raise ValueError(f"{where}: within the bounds of its power law {error}") from None
 
 
 # ---- what all free parameters of a tree are together ----
@@ -408,8 +356,9 @@ class Box(eqx.Module):
     differences: Array
 
     @classmethod
-    def of(cls, free: Sequence[Free]) -> "Box":
+    def of(cls, free: Iterable[Free]) -> "Box":
         """The box of these parameters, one after the other."""
+        free = list(free)
         bounds = [entry.arrays() for entry in free]
         low = np.concatenate([np.ravel(b[1]) for b in bounds]) if bounds else np.zeros(0)
         high = np.concatenate([np.ravel(b[2]) for b in bounds]) if bounds else np.zeros(0)
@@ -421,8 +370,7 @@ class Box(eqx.Module):
         for entry in free:
             here = slice(first, first := first + math.prod(entry.shape))
             if entry.random_walk_sd is not None:
-                rows = np.zeros((here.stop - here.start - 1, len(low)))
-                rows[:, here] = _steps(entry.random_walk_sd, here.stop - here.start)
+                rows = np.diff(np.eye(len(low))[here], axis=0) / np.reshape(entry.random_walk_sd, (-1, 1))
                 differences.append(rows)
                 logs[here] = _random_walk_normaliser(entry.prior, rows[:, here], logs[here])
         return cls(
@@ -510,21 +458,20 @@ class Template(eqx.Module):
         return jax.tree.unflatten(self.structure, leaves)
 
 
-def split(tree: Any, rename: Any = lambda name: name) -> tuple[Template, tuple[str, ...], tuple[Free, ...]]:
-    """Take the free parameters out of a tree: the template, their P names, and the `Free` leaves in the same order.
-
-    Names are paths such as ``layers[0].thickness``; a per-channel parameter has one name a channel, ``base.albedo[1]``.
-    """
+def split(tree: Any, rename: Any = lambda name: name) -> tuple[Template, dict[str, Free]]:
+    """Take the free parameters out of a tree: the template, and the parameters by paths such as
+    ``layers[0].thickness``, in the order of the vector."""
     paths, structure = jax.tree.flatten_with_path(tree, is_leaf=is_free)
-    leaves: list[Any] = []
-    slots: list[tuple[int, int, tuple[int, ...]]] = []
-    names: list[str] = []
-    free: list[Free] = []
-    for path, leaf in paths:
+    slots, free, offset = [], {}, 0
+    for index, (path, leaf) in enumerate(paths):
         if isinstance(leaf, Free):
-            name = rename(jax.tree_util.keystr(path).lstrip("."))
-            slots.append((len(leaves), len(names), leaf.shape))
-            names.extend([name] if leaf.shape == () else [f"{name}[{channel}]" for channel in range(leaf.shape[0])])
-            free.append(leaf)
-        leaves.append(None if isinstance(leaf, Free) else leaf)
-    return Template(tuple(leaves), structure, tuple(slots)), tuple(names), tuple(free)
+            slots.append((index, offset, leaf.shape))
+            free[rename(jax.tree_util.keystr(path).lstrip("."))] = leaf
+            offset += math.prod(leaf.shape)
+    return Template(tuple(None if is_free(leaf) else leaf for _, leaf in paths), structure, tuple(slots)), free
+
+
+def names_of(free: Mapping[str, Free]) -> tuple[str, ...]:
+    """Names of P parameters: one that differs by channel has one a channel, ``base.albedo[1]``."""
+    channels = {name: [f"[{channel}]" for channel in range(math.prod(one.shape))] for name, one in free.items()}
+    return tuple(name + channel for name, one in free.items() for channel in (channels[name] if one.shape else [""]))

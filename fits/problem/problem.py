@@ -10,7 +10,7 @@ import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
-from operator import attrgetter
+from itertools import product
 from typing import Any, NamedTuple, get_args
 
 import equinox as eqx
@@ -18,9 +18,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 import layerjax as lj
+from fits.data.geometry import Floats
 from fits.data.measurements import TO_HAVE_THEM, Measurements
 from fits.data.scans import groups
 from fits.data.totals import Totals
@@ -29,17 +30,15 @@ from fits.problem.compilation import Static, run
 from fits.problem.discrepancy import Discrepancy, Process, make_process, numbers_of
 from fits.problem.hemispherical import Totalling
 from fits.problem.instrument import Instrument, optics_of, setting_of
-from fits.problem.model import Density, JointModel, Model, Parts, Transport
+from fits.problem.model import JointModel, Model, Transport
 from fits.problem.noise import Levels, Noise, is_assumed, noise_levels, require_size
-from fits.problem.parameters import Box, Free, LogNormal, Normal, is_free, require_in_range, split
-from layerjax._checks import in_short, require_kind
+from fits.problem.parameters import Box, Free, LogNormal, Normal, is_free, names_of, require_in_range, split
+from layerjax._checks import in_short, require_choice, require_kind, require_number
 from layerjax._parameters import plain_name
 from layerjax._shapes import channel_count
 from layerjax.mixture import require_material
 from layerjax.stack import with_known
 from layerjax.transport.known_directions import known_directions
-
-Floats = NDArray[np.float64]
 
 UNITS = {
     "noise.floor": "1/sr",
@@ -56,24 +55,12 @@ UNITS = {
 PLACES = ("", "scale", "instrument", "noise.relative", "noise.floor", "noise.discrepancy")
 """How names begin of what stands in each place of `Parts`."""
 
-PER_PARAMETER = tuple(field for field in Box.__dataclass_fields__ if field != "differences")
-"""What a box holds of each parameter."""
-
 
 class Assembled(NamedTuple):
-    """What follows from a problem as it was given.
+    """What follows from a problem as it was given: its parameters by name, and their density."""
 
-    start, low, high: (P,). places: where the parameters of each data set stand in the vector, by its name. free: the
-    parameters as they were given.
-    """
-
-    names: tuple[str, ...]
-    start: Floats
-    low: Floats
-    high: Floats
+    free: dict[str, Free]
     model: Any
-    places: dict[str, tuple[int, ...]]
-    free: tuple[Free, ...] = ()
 
 
 class FittingProblem(abc.ABC):
@@ -99,25 +86,28 @@ class FittingProblem(abc.ABC):
     def with_problems(self, changed: "Mapping[str, Problem]") -> "FittingProblem":
         """The same with other problems in the place of those of the same names."""
 
-    @property
+    @cached_property
     def names(self) -> tuple[str, ...]:
         """Of the P parameters: paths such as ``layers[0].thickness``, ``noise.floor`` or ``scale``."""
-        return self._assembled.names
+        return names_of(self._assembled.free)
 
-    @property
+    @cached_property
     def start(self) -> Floats:
         """Where the parameters start, (P,)."""
-        return self._assembled.start
+        return self._joined(0)
 
-    @property
+    @cached_property
     def low(self) -> Floats:
         """Lower bounds of the parameters, (P,)."""
-        return self._assembled.low
+        return self._joined(1)
 
-    @property
+    @cached_property
     def high(self) -> Floats:
         """Upper bounds of the parameters, (P,)."""
-        return self._assembled.high
+        return self._joined(2)
+
+    def _joined(self, place: int) -> Floats:
+        return np.concatenate([one.arrays()[place].ravel() for one in self._assembled.free.values()])
 
     @property
     def units(self) -> dict[str, str]:
@@ -138,7 +128,7 @@ class FittingProblem(abc.ABC):
         """Where the parameters of one data set stand in the vector."""
         if name not in self.problems:
             raise ValueError(f"part {name!r} is not one of {', '.join(self.problems)}")
-        return self._assembled.places[name]
+        return dict(zip(self.problems, self.model.places, strict=True))[name]
 
     def shares(self, predicted: Floats) -> dict[str, Floats]:
         """What `predict` gives of each data set, in the shape of its data."""
@@ -152,34 +142,38 @@ class FittingProblem(abc.ABC):
 
     def predict(self, vector: ArrayLike) -> Array:
         """Scaled BSDF of the used samples, (N, C), in 1/sr; of several data sets one after the other, (N, 1)."""
-        return self.call(Density.predict, vector)
+        return self.call(Model.predict, vector)
 
     def residuals(self, vector: ArrayLike) -> Array:
         """All residuals of the least-squares problem, (rows,): half their sum of squares is what a fit minimises."""
-        return jnp.concatenate([part.reshape(-1) for part in self.call(Density.residuals, vector)])
+        return jnp.concatenate([part.reshape(-1) for part in self.call(Model.residuals, vector)])
 
     def log_likelihood(self, vector: ArrayLike) -> Array:
         """Normalised log-likelihood of the used samples with the physical vector (P,)."""
-        return self.call(Density.log_likelihood, vector)
+        return self.call(Model.log_likelihood, vector)
 
     def log_likelihood_per_datum(self, vector: ArrayLike) -> Array:
         """Normalised log-density of each datum with the physical vector (P,), (N, C)."""
-        return self.call(Density.log_likelihood_per_datum, vector)
+        return self.call(Model.log_likelihood_per_datum, vector)
 
     def log_prior(self, vector: ArrayLike) -> Array:
         """Log-density of the physical vector, -inf outside the bounds."""
-        return self.call(Density.log_prior, vector)
+        return self.call(Model.log_prior, vector)
 
     def log_posterior_unconstrained(self, u: ArrayLike) -> Array:
         """Log-posterior over the unconstrained vector (P,), -inf where undefined."""
-        return self.call(Density.log_posterior_unconstrained, u)
+        return self.call(Model.log_posterior_unconstrained, u)
 
     def call(self, function: Callable[..., Any], *arguments: Any) -> Any:
-        """`function(model, *arguments)`, compiled once for all of this structure; of a method of `Density` the model's
+        """`function(model, *arguments)`, compiled once for all of this structure; of a method of `Model` the model's
         own of that name."""
-        if function in vars(Density).values():
+        if function in vars(Model).values():
             function = getattr(type(self.model), function.__name__)
-        arrays = (jax.tree.map(jnp.asarray, argument, is_leaf=_is_vector) for argument in arguments)
+
+        def is_vector(argument: Any) -> bool:  # numbers that are listed make an array; a named tuple holds arrays
+            return type(argument) in (list, tuple)
+
+        arrays = (jax.tree.map(jnp.asarray, argument, is_leaf=is_vector) for argument in arguments)
         return run(function, self.split_model, *arrays)
 
     @cached_property
@@ -187,11 +181,6 @@ class FittingProblem(abc.ABC):
         """The model's arrays, and what is static in it wrapped for use as a key."""
         arrays, static = eqx.partition(self.model, eqx.is_array)
         return arrays, Static(static)
-
-
-def _is_vector(argument: Any) -> bool:
-    """Whether numbers are listed, which make an array; a named tuple holds arrays."""
-    return type(argument) in (list, tuple)
 
 
 @dataclass(frozen=True, eq=False)
@@ -238,8 +227,7 @@ class Problem(FittingProblem):
     @property
     def common_names(self) -> tuple[str, ...]:
         """Names of the parameters that are the same for all texels of a map, one a channel where numbers are."""
-        marks = [one.same_for_all_texels for one in self._assembled.free for _ in range(one.arrays()[0].size)]
-        return tuple(name for name, marked in zip(self.names, marks, strict=True) if marked)
+        return names_of({name: one for name, one in self._assembled.free.items() if one.same_for_all_texels})
 
     @property
     def noise_is_assumed(self) -> bool:
@@ -255,16 +243,12 @@ class Problem(FittingProblem):
         """What stands in its place."""
         return changed.get("", self)
 
-    def build(self, vector: ArrayLike) -> Parts:
-        """Stack, scale and noise levels with the physical vector (P,)."""
-        return super().build(vector)
-
     def predict_at(self, vectors: ArrayLike, wi: ArrayLike, wo: ArrayLike) -> Array:
         """Scaled BSDF along other directions, (M, 3) each, with D vectors (D, P): (D, M, C), in 1/sr."""
         wi, wo = np.asarray(wi, float), np.asarray(wo, float)
         model = replace(self.model, **_directions(self, wi, wo))
         arrays, static = eqx.partition(model, eqx.is_array)
-        return run(_over_vectors, (arrays, Static(static)), jnp.asarray(vectors))
+        return run(_predictions, (arrays, Static(static)), jnp.asarray(vectors))
 
     def with_other_rays(self) -> "Problem":
         """The problem with other numbers of rays for the cones of its instrument: what differs is their error."""
@@ -297,9 +281,9 @@ class Joint(FittingProblem):
 
     Args:
         parts: the problems by name, two or more, each with a likelihood.
-        shared: names of parameters that are one in all problems: ``layers[0].ior``, or how names begin, such as
-            ``layers[0]`` for all that is free in that layer. Bounds and priors must agree; they start as in the first.
-            The others are named after their problem, ``plane.scale``.
+        shared: names of parameters that are one in all problems: ``layers[0].ior``, with all its channels, or how names
+            begin, such as ``layers[0]`` for all that is free in that layer. Bounds and priors must agree; they start as
+            in the first. The others are named after their problem, ``plane.scale``.
 
     Raises:
         ValueError: fewer than two problems, a named objective, a shared name that is not in every problem, or free
@@ -322,56 +306,35 @@ class Joint(FittingProblem):
     def _assembled(self) -> Assembled:
         # what is shared comes first, then the others of each data set under its name
         common = self._common()
-        names, places = list(common), dict[str, tuple[int, ...]]()
-        for part, problem in self.parts.items():
-            own = [name if name in common else f"{part}.{name}" for name in problem.names]
-            names += [name for name in own if name not in common]
-            places[part] = tuple(map(names.index, own))
-
-        def gathered(key: str) -> NDArray[Any]:
-            """What each data set has of its parameters, at their places in the vector; of shared ones, of the first."""
-            values = {part: np.asarray(attrgetter(key)(problem)) for part, problem in self.parts.items()}
-            found = np.zeros(len(names), next(iter(values.values())).dtype)
-            for part in reversed(values):
-                found[list(places[part])] = values[part]
-            return found
-
-        walks: list[Floats] = []  # rows of random walks over channels; of shared ones once
-        for part, problem in self.parts.items():
-            for row in np.asarray(problem.model.box.differences):
-                whole = np.zeros(len(names))
-                whole[list(places[part])] = row
-                walks += [] if any(np.array_equal(whole, one) for one in walks) else [whole]
-        each = {key: jnp.asarray(gathered(f"model.box.{key}")) for key in PER_PARAMETER}
+        own = {
+            part: {name if name in common else f"{part}.{name}": one for name, one in problem._assembled.free.items()}
+            for part, problem in self.parts.items()
+        }
+        free = common | {name: one for some in own.values() for name, one in some.items() if name not in common}
+        place = {name: index for index, name in enumerate(names_of(free))}
+        places = tuple(tuple(place[name] for name in names_of(some)) for some in own.values())
         models = tuple(problem.model for problem in self.parts.values())
-        model = JointModel(
-            parts=models,
-            box=Box(**each, differences=jnp.asarray(np.array(walks).reshape(-1, len(names)))),
-            places=tuple(places.values()),
-            varying=any(one.varying for one in models),
-        )
-        start, low, high = map(gathered, ("start", "low", "high"))
-        return Assembled(tuple(names), start, low, high, model, places)
+        varying = any(one.varying for one in models)
+        return Assembled(free, JointModel(parts=models, box=Box.of(free.values()), places=places, varying=varying))
 
-    def _common(self) -> list[str]:
-        """The shared names, as the first data set has them. ValueError where they are not in every one, or differ."""
-        (first, one), *others = self.parts.items()
+    def _common(self) -> dict[str, Free]:
+        """What is shared, as the first data set has it. ValueError where it is not in every one, or differs."""
+        sets = {part: problem._assembled.free for part, problem in self.parts.items()}
+        (first, common), *others = sets.items()
         for given in self.shared:
-            sets = {part: set(filter(_begins(given), problem.names)) for part, problem in self.parts.items()}
-            every = set.union(*sets.values())
+            every = {name for free in sets.values() for name in free if _begins(given, name)}
             if not every:
                 raise ValueError(f"Joint.shared: no problem has a free parameter {given!r}")
-            for part, names in sets.items():
-                if names != every:
-                    missing = ", ".join(sorted(every - names))
-                    raise ValueError(f"Joint.shared: {missing} is not free in {part!r}; it must be in every problem")
-        common = [name for name in one.names if any(_begins(given)(name) for given in self.shared)]
-        for name in common:
-            for part, problem in others:
-                if not _same(one, problem, name):
-                    raise ValueError(
-                        f"Joint.shared: {name} has other bounds or another prior in {part!r} than in {first!r}"
-                    )
+            for part, free in sets.items():
+                if missing := every - set(free):
+                    words = ", ".join(sorted(missing))
+                    raise ValueError(f"Joint.shared: {words} is not free in {part!r}; it must be in every problem")
+        common = {name: one for name, one in common.items() if any(_begins(given, name) for given in self.shared)}
+        for (name, one), (part, free) in product(common.items(), others):
+            if not _same(one, free[name]):
+                raise ValueError(
+                    f"Joint.shared: {name} has other bounds or another prior in {part!r} than in {first!r}"
+                )
         return common
 
     def build(self, vector: ArrayLike) -> JointParts:
@@ -387,22 +350,23 @@ class Joint(FittingProblem):
 
     def with_problems(self, changed: Mapping[str, Problem]) -> "Joint":
         """The same with other problems in the place of those of the same names; what is new in them is not shared."""
-        return Joint({**self.parts, **changed}, self._common()) if changed else self
+        return Joint({**self.parts, **changed}, list(self._common())) if changed else self
 
 
-def _begins(prefix: str) -> Callable[[str], bool]:
+def _begins(prefix: str, name: str) -> bool:
     """Whether a parameter's name is this, or that of a part of it."""
-    return lambda name: name == prefix or name.startswith((f"{prefix}.", f"{prefix}["))
+    return name == prefix or name.startswith((f"{prefix}.", f"{prefix}["))
 
 
-def _same(one: Problem, other: Problem, name: str) -> bool:
-    """Whether a parameter has the same bounds and prior in both."""
-    i, j = one.names.index(name), other.names.index(name)
-    mine, theirs = one.model.box, other.model.box
-    first, second = (np.asarray(box.differences[:, place]) for box, place in ((mine, i), (theirs, j)))
-    return np.array_equal(first[first != 0.0], second[second != 0.0]) and all(
-        math.isclose(float(getattr(mine, field)[i]), float(getattr(theirs, field)[j]), rel_tol=1e-12)
-        for field in PER_PARAMETER
+def _same(one: Free, other: Free) -> bool:
+    """Whether two parameters have the same bounds and prior."""
+    bounds = (
+        np.broadcast_arrays(mine, theirs) for mine, theirs in zip(one.arrays()[1:], other.arrays()[1:], strict=True)
+    )
+    return (
+        one.shape == other.shape
+        and all(np.allclose(mine, theirs, rtol=1e-12, atol=0.0) for mine, theirs in bounds)
+        and (one.prior, one.random_walk_sd) == (other.prior, other.random_walk_sd)
     )
 
 
@@ -426,16 +390,16 @@ def _assemble(problem: Problem) -> Assembled:
     scale = 1.0 if problem.scale is None else problem.scale
     rest = (scale, setting, levels.relative, levels.floor, correlation)
     rest = jax.tree.map(lambda x: x if is_free(x) else jnp.asarray(x), rest, is_leaf=is_free)
-    template, names, free = split((_with_known(problem.stack), *rest), _parameter_name)
-    if not names:
+    template, free = split((_with_known(problem.stack), *rest), _parameter_name)
+    if not free:
         raise ValueError("stack: nothing is free; put fits.Free(start, low, high) where a number is to be fitted")
-
     _require_weights(problem.objective, levels, process, free)
+    names = names_of(free)
 
     # 3. the same as arrays
     model = Model(
         template=template,
-        box=Box.of(free),
+        box=Box.of(free.values()),
         values=jnp.asarray(used.values),
         variance=jnp.asarray(np.broadcast_to(levels.variance, used.values.shape)),
         lowest=jnp.asarray(np.broadcast_to(levels.smallest, used.values.shape)),
@@ -449,18 +413,18 @@ def _assemble(problem: Problem) -> Assembled:
         moving=sum(not name.startswith("noise.") for name in names),
         **_directions(problem, used.wi, used.wo),
     )
-    start, low, high = (np.concatenate([np.ravel(entry.arrays()[i]) for entry in free]) for i in range(3))
-    material = model.build(jnp.asarray(start)).stack
+    start = jnp.asarray(np.concatenate([entry.arrays()[0].ravel() for entry in free.values()]))
+    material = model.build(start).stack
     if isinstance(material, lj.Stack | lj.Mixture):
         channel_count(material)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", lj.ResolutionWarning)  # nothing is solved here
-        shape = eqx.filter_eval_shape(model.predict, jnp.asarray(start)).shape
+        shape = eqx.filter_eval_shape(model.predict, start).shape
     if shape[-1] not in (1, used.values.shape[-1]):
         raise ValueError(f"stack: it has {shape[-1]} channels, the data {used.values.shape[-1]}: {used.channels}")
     if np.broadcast_shapes(shape, used.values.shape) != used.values.shape:
         raise ValueError(f"transport: it gives values of shape {shape}, the data have {used.values.shape}")
-    return Assembled(names, start, low, high, model, {"": tuple(range(len(names)))}, free)
+    return Assembled(free, model)
 
 
 def _require_kinds(problem: Problem) -> None:
@@ -471,12 +435,9 @@ def _require_kinds(problem: Problem) -> None:
     require_kind("data", problem.data, Measurements, fix=TO_HAVE_THEM)
     require_kind("noise", problem.noise, Noise)
     require_kind("instrument", problem.instrument, Instrument, None)
-    if problem.objective not in get_args(Objective):
-        raise ValueError(f"objective is {problem.objective!r}; it must be one of {', '.join(get_args(Objective))}")
-    scale = problem.scale
-    above_zero = isinstance(scale, int | float) and math.isfinite(scale) and scale > 0
-    if not (scale is None or is_free(scale) or above_zero):
-        raise ValueError(f"scale is {scale!r}; it must be a finite number above 0, Free or None")
+    require_choice("objective", problem.objective, get_args(Objective))
+    if not (problem.scale is None or is_free(problem.scale)):
+        require_number("scale", problem.scale, 0.0, open_ends=True)
     require_in_range(problem.stack)
     if isinstance(problem.data, Totals):
         for name, given in (("instrument", problem.instrument), ("noise.discrepancy", problem.noise.discrepancy)):
@@ -484,7 +445,7 @@ def _require_kinds(problem: Problem) -> None:
                 raise ValueError(f"{name} is given, but the data are totals, which have no direction of view")
 
 
-def _require_weights(objective: Objective, levels: Levels, process: Process | None, free: tuple[Free, ...]) -> None:
+def _require_weights(objective: Objective, levels: Levels, process: Process | None, free: Mapping[str, Free]) -> None:
     """A likelihood needs noise; beside a named residual nothing may stand that only a likelihood weighs."""
     if objective == "likelihood":
         require_size(levels)
@@ -494,10 +455,12 @@ def _require_weights(objective: Objective, levels: Levels, process: Process | No
     fitted = [f"noise.{name}" for name in ("relative", "floor") if is_free(getattr(levels, name))]
     if fitted or process is not None:
         raise ValueError(f"{(*fitted, 'noise.discrepancy')[0]}: objective {objective!r} has no noise model to fit")
-    weighted = [f"the prior {one.prior}" for one in free if isinstance(one.prior, Normal | LogNormal)]
-    weighted += [f"Free.random_walk_sd {one.random_walk_sd}" for one in free if one.random_walk_sd is not None]
-    if weighted:
-        raise ValueError(f"{weighted[0]} has no weight beside objective {objective!r}; omit it")
+    for one in free.values():
+        if isinstance(one.prior, Normal | LogNormal):
+            raise ValueError(f"the prior {one.prior} has no weight beside objective {objective!r}; omit it")
+        if one.random_walk_sd is not None:
+            words = f"Free.random_walk_sd {one.random_walk_sd} has no weight beside objective {objective!r}; omit it"
+            raise ValueError(words)
 
 
 def _with_known(stack: Any) -> Any:
@@ -550,7 +513,7 @@ def polar_angles(data: Measurements) -> Floats:
     return np.round([np.mean(theta[rows]) for rows in groups(theta)], 2)
 
 
-def _over_vectors(model: Model, vectors: Array) -> Array:
+def _predictions(model: Model, vectors: Array) -> Array:
     return jax.lax.map(model.predict, vectors)
 
 

@@ -1,6 +1,6 @@
 """Simulated goniometer data: a stack seen along slices, with noise of known size."""
 
-import math
+import sys
 
 import numpy as np
 
@@ -10,7 +10,7 @@ from fits.data.geometry import Geometry as Geometry
 from fits.data.geometry import slices as slices
 from fits.data.measurements import SMALLEST_SIGMA, Measurements, Source, channel_names
 from fits.problem.model import Transport, forward
-from layerjax._checks import in_short, require_kind, require_seed
+from layerjax._checks import require_kind, require_number, require_seed
 from layerjax.compiling import programs_kept
 from layerjax.mixture import stacks_of
 
@@ -43,11 +43,8 @@ def simulate(
         ValueError: a negative `noise` or `floor`, a light below an opaque stack, or a transport that is random or
             cannot carry the stack.
     """
-    for name, level in (("noise", noise), ("floor", floor)):
-        if not (isinstance(level, int | float | np.number) and math.isfinite(level) and level >= 0):
-            raise ValueError(f"{name} is {in_short(level)}, must be finite and >= 0")
-    if noise > 1.0:
-        raise ValueError(f"noise is {noise:g}, must be at most 1 (0.05 is 5 %)")
+    require_number("noise", noise, 0.0, 1.0)
+    require_number("floor", floor, 0.0, sys.float_info.max)
     require_kind("geometry", geometry, Geometry, Measurements)
     require_seed(seed)
     require_visible("simulate", stack, light=geometry.wi)

@@ -75,7 +75,7 @@ _TRANSPORTS: _Kinds = {
 }
 _LAWS: _Kinds = {"PowerLaw": PowerLaw}
 _PRIORS: _Kinds = {kind.__name__: kind for kind in (Uniform, LogUniform, Normal, LogNormal)}
-_FREE_KEYS = ("start", "low", "high", "prior", "random_walk_sd", "same_for_all_texels")
+_FREE_KEYS = tuple(one.name for one in fields(Free))
 
 
 @dataclass(frozen=True, eq=False)
@@ -328,13 +328,10 @@ def _value(where: str, value: Any, hint: Any, name: str) -> Any:
         return numbers(where, value) if float in kinds else whole_numbers(where, value, len(kinds))
     if name.endswith(".phase"):
         return _build(where, value, _PHASES)
-    return _number_or_free(where, value, lj.RANGES.get(name, ANY))
-
-
-def _number_or_free(where: str, value: Any, allowed: Range) -> float | tuple[float, ...] | Free | PowerLaw:
     if isinstance(value, dict) and "kind" in value:
-        return cast(PowerLaw, _build(where, value, _LAWS))
-    return _free(where, value, allowed) if isinstance(value, dict) else numbers(where, value, allowed)
+        return _build(where, value, _LAWS)
+    read = _free if isinstance(value, dict) else numbers
+    return read(where, value, lj.RANGES.get(name, ANY))
 
 
 def _free(where: str, table: Any, allowed: Range = ANY) -> Free:
@@ -343,12 +340,17 @@ def _free(where: str, table: Any, allowed: Range = ANY) -> Free:
     for key in ("start", "low", "high"):
         if key not in table:
             raise ValueError(f"{where} has no {key}, a free parameter must have start, low and high")
-    bounds = {key: numbers(f"{where}.{key}", table[key], allowed) for key in ("start", "low", "high")}
-    prior = cast(Prior, _build(f"{where}.prior", table["prior"], _PRIORS)) if "prior" in table else None
-    steps = numbers(f"{where}.random_walk_sd", table["random_walk_sd"], ANY) if "random_walk_sd" in table else None
-    same = truth(f"{where}.same_for_all_texels", table.get("same_for_all_texels", False))
+    given: dict[str, Any] = {}
+    for key, value in table.items():
+        place = f"{where}.{key}"
+        if key == "prior":
+            given[key] = _build(place, value, _PRIORS)
+        elif key == "same_for_all_texels":
+            given[key] = truth(place, value)
+        else:
+            given[key] = numbers(place, value, ANY if key == "random_walk_sd" else allowed)
     try:
-        return Free(**bounds, prior=prior, random_walk_sd=steps, same_for_all_texels=same)
+        return Free(**given)
     except ValueError as error:
         raise ValueError(f"{where}: {str(error).replace('Free.', '')}") from None
 
@@ -451,7 +453,7 @@ def stack_to_dict(stack: lj.Stack) -> dict[str, Any]:
     return tables
 
 
-def changed_to_dict(thing: Noise | Instrument) -> dict[str, Any]:
+def changed_to_dict(thing: Noise | Instrument | Discrepancy | Free) -> dict[str, Any]:
     """What is not as it is by default, of plain numbers, strings, lists and dictionaries."""
     every = {entry.name: (getattr(thing, entry.name), entry.default) for entry in fields(thing)}
     return {name: to_plain(value) for name, (value, default) in every.items() if value != default}
@@ -474,16 +476,13 @@ def _module_to_dict(module: Any) -> dict[str, Any]:
 
 def to_plain(value: Any) -> Any:
     if isinstance(value, Free):
-        table = {key: getattr(value, key) for key in _FREE_KEYS}
-        left_out = {"prior": Uniform(), "random_walk_sd": None, "same_for_all_texels": False}
-        return {key: to_plain(entry) for key, entry in table.items() if key not in left_out or entry != left_out[key]}
+        return changed_to_dict(value)
     if isinstance(value, str | bool | int):
         return value
     if isinstance(value, lj.PhaseFunction | Prior | PowerLaw):
         return _module_to_dict(value)
     if isinstance(value, Discrepancy):
-        table = {entry.name: getattr(value, entry.name) for entry in fields(value)}
-        return {name: to_plain(entry) for name, entry in table.items() if entry is not None} or True
+        return changed_to_dict(value) or True
     array = np.asarray(value)
     if array.dtype.kind == "i":
         return array.tolist()

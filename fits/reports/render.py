@@ -9,17 +9,16 @@ from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure, SubFigure
 from matplotlib.ticker import MaxNLocator
-from numpy.typing import NDArray
 from scipy.interpolate import RegularGridInterpolator
 
 import layerjax as lj
+from fits.data.geometry import Floats
 from fits.reports.plots.data import CYCLE, STYLE
 from layerjax._checks import in_short
 from layerjax.mixture import require_material, stacks_of
 
 Prepared = lj.Prepared | lj.Mixture
 
-Floats = NDArray[np.float64]
 
 LIGHTS = {
     "lit from the front": (-0.4, 0.5, 0.77),

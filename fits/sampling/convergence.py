@@ -11,14 +11,12 @@ from dataclasses import dataclass, replace
 
 import emcee
 import numpy as np
-from numpy.typing import NDArray
 
+from fits.data.geometry import Floats
 from fits.sampling.options import FIRST_CHECK, SamplerOptions
 
 GROUPS = 4
 FEWEST_DRAWS = 8
-
-Floats = NDArray[np.float64]
 
 
 CHECKS = FIRST_CHECK * np.unique(np.ceil(1.1 ** np.arange(100.0)).astype(int))

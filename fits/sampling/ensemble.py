@@ -9,12 +9,12 @@ from functools import partial
 
 import emcee
 import numpy as np
-from numpy.typing import NDArray
 
+from fits.data.geometry import Floats
 from fits.optimise.result import Fit
-from fits.problem.compilation import cores, in_shares, one_thread
+from fits.problem.compilation import one_thread
 from fits.sampling.chain import Chain
-from fits.sampling.initial import first_positions, initial_mixture, log_posteriors
+from fits.sampling.initial import first_positions, initial_mixture, log_posteriors, share_of
 from fits.sampling.mixture import Mixture
 from fits.sampling.options import SamplerOptions
 from fits.sampling.proposals import Density, FittedProposal, propose
@@ -22,11 +22,12 @@ from fits.sampling.proposals import Density, FittedProposal, propose
 FITS = (25 * 1.5 ** np.arange(40.0)).astype(int)
 """Steps after which proposals are fitted again: often while the chain is short, seldom once it is long."""
 
+FEWEST = 1000
+"""Draws that a density is fitted to, at least: on a ridge one that is fitted to fewer is worse than the first."""
+
 DIFFERENCE = 1.2
 """Length of differential evolution, where 2.38 is best for a normal posterior: curved ones are narrower than they are
 long."""
-
-Floats = NDArray[np.float64]
 
 
 class Ensemble:
@@ -34,9 +35,9 @@ class Ensemble:
 
     def __init__(self, fit: Fit, chain: Chain, seed: int, options: SamplerOptions):
         self.problem, self.chain, self.seed, self.options = fit.problem, chain, seed, options
-        self._compiled = False
+        self.share, self._compiled = share_of(chain.shape[0]), False
         if not chain.moves:
-            chain.decide({"initial": initial_mixture(fit, options.smallest_mode).record()})
+            chain.decide({"initial": initial_mixture(fit, self.share, options.smallest_mode).record()})
 
     def advance(self, step: int, show: Callable[[], None]) -> None:
         """Append steps to the chain until it has `step` of them, and `show` each."""
@@ -52,17 +53,13 @@ class Ensemble:
             sampler = emcee.EnsembleSampler(
                 *self.chain.shape, self.log_posteriors, moves=moves, vectorize=True, backend=self.chain
             )
-            count = min(step, next_fit(begin)) - begin
+            count = min(step, int(FITS[begin < FITS].min())) - begin  # until proposals are fitted again
             # walkers are drawn from a density of full rank: emcee need not look whether they are
             for _ in sampler.sample(state, iterations=count, skip_initial_state_check=True):
                 show()
 
     def log_posteriors(self, positions: Floats) -> Floats:
-        """At positions (count, P), on all cores: half of the walkers, which move together, are a share for each."""
-        share = max(1, self.chain.shape[0] // (2 * cores()))
-        (found,) = in_shares(
-            lambda part: [self.problem.call(log_posteriors, part)], positions, share, compiled=self._compiled
-        )
+        found = log_posteriors(self.problem, positions, self.share, self._compiled)
         self._compiled = True
         return found
 
@@ -81,13 +78,8 @@ def proposals_of(chain: Chain) -> Density:
     fits only.
     """
     initial, last = Mixture(**chain.moves["initial"]), FITS[chain.iteration >= FITS].max(initial=0)
-    if not last:
+    if (last - last // 2) * chain.shape[0] < FEWEST:
         return initial
     positions = chain.chain[last // 2 : last].reshape(-1, chain.shape[-1])
     with one_thread():  # the same to the last bit, whatever else runs
         return FittedProposal.to(positions.copy(), np.random.RandomState(last), initial)
-
-
-def next_fit(step: int) -> int:
-    """The first step after this one that proposals are fitted at again."""
-    return int(FITS[step < FITS].min())

@@ -15,11 +15,13 @@ from jax import Array
 from numpy.typing import NDArray
 from scipy.special import logit, logsumexp
 
+from fits.data.geometry import Floats
 from fits.optimise.multi_start import least_squares_descent, unit_of
 from fits.optimise.result import Fit, Minimum
 from fits.optimise.uncertainty import local_information, uncertainty
+from fits.problem.compilation import cores, in_shares
 from fits.problem.model import Model
-from fits.problem.problem import Problem
+from fits.problem.problem import FittingProblem, Problem
 from fits.sampling.mixture import NARROWEST, Mixture
 from fits.sampling.options import SamplerOptions
 from fits.sampling.ridge import Ridge, open_directions, ridge
@@ -33,18 +35,17 @@ APART = 3.0  # standard deviations: minima that are closer are one mode
 MOST_MODES = 8
 LOWEST_MINIMUM = 8.0  # in the log-posterior, below the best: what lies lower holds next to nothing, however broad it is
 
-Floats = NDArray[np.float64]
-
 
 def initial_mixture(
-    fit: Fit, smallest_mode: float = SamplerOptions.smallest_mode, *, along_ridges: bool = True
+    fit: Fit, share: int, smallest_mode: float = SamplerOptions.smallest_mode, *, along_ridges: bool = True
 ) -> Mixture:
     """About those minima of a fit that hold a share of its posterior, in whose modes its components are.
 
+    share: see `log_posteriors`.
     along_ridges: which takes some hundred Jacobians where a direction is unidentified.
     """
     problem = fit.problem
-    found = [_about(problem, fit.vector, np.isin(problem.names, fit.at_bound), along_ridges)]
+    found = [_about(problem, fit.vector, np.isin(problem.names, fit.at_bound), share, along_ridges)]
     for minimum in other_minima(fit):
         end = least_squares_descent(problem, unit_of(problem, vector_of(fit, minimum)), fresh=False)
         position = logit(np.clip(unit_of(problem, end.vector), INSIDE, 1.0 - INSIDE))[None]
@@ -52,13 +53,14 @@ def initial_mixture(
             np.min(one.squared_distance(position)) < APART**2 for one in found
         ):
             continue
-        found.append(_about(problem, end.vector, uncertainty(problem, end.vector, end.cost).at_bound, along_ridges))
+        at_bound = uncertainty(problem, end.vector, end.cost).at_bound
+        found.append(_about(problem, end.vector, at_bound, share, along_ridges))
     mass = np.array([logsumexp(one.log_weight) for one in found])
     kept = [one for one, its in zip(found, mass, strict=True) if its > np.max(mass) + np.log(smallest_mode)]
     return Mixture.of_modes(kept)
 
 
-def _about(problem: Problem, vector: Floats, at_bound: NDArray[np.bool_], along_ridges: bool) -> Mixture:
+def _about(problem: Problem, vector: Floats, at_bound: NDArray[np.bool_], share: int, along_ridges: bool) -> Mixture:
     """About the points of the ridge of a minimum (P,), or that alone; weights are logarithms of masses of posterior.
 
     By the information at the minimum: where a direction is unidentified, the covariance of a fit has lost the others.
@@ -91,7 +93,7 @@ def _about(problem: Problem, vector: Floats, at_bound: NDArray[np.bool_], along_
         log_weight=np.zeros(count),
         mode=np.zeros(count, int),
     )
-    log_posterior_there = np.asarray(problem.call(log_posteriors, mixture.centre), float)
+    log_posterior_there = log_posteriors(problem, mixture.centre, share)
     own = np.diagonal(mixture.log_parts(mixture.centre))
     return replace(mixture, log_weight=np.where(np.isfinite(log_posterior_there), log_posterior_there, -np.inf) - own)
 
@@ -129,8 +131,19 @@ def vector_of(fit: Fit, minimum: Minimum) -> Floats:
     return np.array([minimum.values[name] for name in fit.problem.names])
 
 
-def log_posteriors(model: Model, positions: Array) -> Array:
-    """Log-posterior at each of `positions` (count, P) in unconstrained coordinates."""
+def log_posteriors(problem: FittingProblem, positions: Floats, share: int, compiled: bool = False) -> Floats:
+    """Log-posterior (count,) at positions (count, P) in unconstrained coordinates, on all cores: one program, for so
+    many at a time, whatever their number. compiled: see `in_shares`."""
+    (found,) = in_shares(lambda part: [problem.call(_log_posteriors, part)], positions, share, compiled)
+    return found
+
+
+def share_of(walkers: int) -> int:
+    """Half of an ensemble moves together: what each core has of it."""
+    return max(1, walkers // (2 * cores()))
+
+
+def _log_posteriors(model: Model, positions: Array) -> Array:
     return jax.lax.map(model.log_posterior_unconstrained, positions)  # one walker fits the cache: twice as fast as vmap
 
 

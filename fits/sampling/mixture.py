@@ -11,14 +11,14 @@ from scipy import stats
 from scipy.cluster.vq import ClusterError, kmeans2
 from scipy.special import expit, gammaln, logit, logsumexp
 
+from fits.data.geometry import Floats
+
 DEGREES_OF_FREEDOM = 6.0
 COMPONENTS = 4  # of mixtures that are fitted to draws: more follow what is there by chance
 ITERATIONS = 10
 MOST_SAMPLES = 8000
 SMALLEST_VARIANCE = 1e-12  # of a unit, that a combination of parameters keeps
 NARROWEST, INSIDE = 1e-9, 1e-9  # in log-odds; of the box
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

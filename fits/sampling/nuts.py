@@ -14,23 +14,21 @@ import emcee
 import jax
 import numpy as np
 from jax import Array
-from numpy.typing import NDArray
 
+from fits.data.geometry import Floats
 from fits.optimise.result import Fit
 from fits.problem.compilation import cores, in_shares
 from fits.problem.model import Model
 from fits.progress import Progress
 from fits.sampling.chain import Chain
 from fits.sampling.ensemble import FITS, proposals_of
-from fits.sampling.initial import first_positions, initial_mixture, log_posteriors
+from fits.sampling.initial import first_positions, initial_mixture, log_posteriors, share_of
 from fits.sampling.mixture import Mixture
 from fits.sampling.options import SamplerOptions
 from fits.sampling.proposals import propose
 
 CHAINS = 4
 DRAWS = 4096  # of the approximation, for its covariance
-
-Floats = NDArray[np.float64]
 
 
 def require_blackjax() -> None:
@@ -48,7 +46,7 @@ class Nuts:
         self.problem, self.chain, self.seed = fit.problem, chain, seed
         self._compiled: set[Callable[..., Any]] = set()
         if not chain.moves:
-            self._warm_up(initial_mixture(fit, options.smallest_mode), options, progress)
+            self._warm_up(initial_mixture(fit, share_of(chain.shape[0]), options.smallest_mode), options, progress)
 
     def _warm_up(self, initial: Mixture, options: SamplerOptions, progress: Progress | None) -> None:
         """Before the first step, and for all: where each chain begins, its metric, and the length of its steps."""
@@ -96,7 +94,7 @@ class Nuts:
         return found
 
     def _log_posteriors(self, positions: Floats) -> Floats:
-        return np.asarray(self.problem.call(log_posteriors, positions), float)
+        return log_posteriors(self.problem, positions, share_of(len(positions)))
 
 
 @cache

@@ -1,6 +1,6 @@
 """What decides how a posterior is sampled, and when its chain is long enough."""
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 from layerjax._checks import require_count, require_number
 
@@ -41,22 +41,15 @@ class SamplerOptions:
     """Local minima whose mass, by Laplace's approximation, is below this share of the largest are no modes."""
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            if not (field.name == "walkers" and self.walkers is None):
-                require_number(field.name, getattr(self, field.name))
         for name, least in (("walkers", 1), ("warm_up", 1), ("max_steps", FIRST_CHECK)):
             if not (name == "walkers" and self.walkers is None):
                 require_count(name, getattr(self, name), least)
         for name in ("ess", "autocorrelation_times"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name} is {getattr(self, name)}; it must be above 0")
-        if not 0.0 <= self.independent < 1.0:
-            raise ValueError(f"independent is {self.independent}; it must be at least 0 and below 1")
+            require_number(name, getattr(self, name), 0.0, open_ends=True)
         for name in ("burn_in", "target_acceptance", "smallest_mode"):
-            if not 0.0 < getattr(self, name) < 1.0:
-                raise ValueError(f"{name} is {getattr(self, name)}; it must be between 0 and 1")
-        if not self.r_hat > 1.0:
-            raise ValueError(f"r_hat is {self.r_hat}; it must be above 1")
+            require_number(name, getattr(self, name), 0.0, 1.0, open_ends=True)
+        require_number("r_hat", self.r_hat, 1.0, open_ends=True)
+        require_number("independent", self.independent, 0.0, 0.99)
 
 
 FIRST_CHECK = 100

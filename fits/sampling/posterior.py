@@ -10,9 +10,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from numpy.typing import NDArray
 
 from fits._lazy import shown_by
+from fits.data.geometry import Floats
 from fits.optimise.result import Fit
 from fits.problem.discrepancy import logarithm
 from fits.problem.model import Model
@@ -28,8 +28,6 @@ if TYPE_CHECKING:
 REPORTED_DRAWS = 2048
 MODE_STEPS = 1000
 """Steps of a chain by which shares of modes are estimated."""
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
+from fits.data.geometry import Floats
 from fits.sampling.mixture import NARROWEST, Mixture
 
 SCORES = np.linspace(-2.0, 2.0, 17)
@@ -23,8 +24,6 @@ LINEAR_SHARE = 0.02
 
 INITIAL_SHARE = 0.1
 """Of proposals: those from the approximations of the fit, which know of modes that were not visited."""
-
-Floats = NDArray[np.float64]
 
 
 class Density(Protocol):

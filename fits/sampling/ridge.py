@@ -9,7 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import expit, logit
 
+from fits.data.geometry import Floats
 from fits.optimise.uncertainty import local_information, square
+from fits.problem.compilation import on_all_cores
 from fits.problem.problem import Problem
 
 OPEN = 0.1  # boxes: a posterior that is wider may bend
@@ -21,8 +23,6 @@ NEXT_TO_BOUND = 0.02  # of the box
 ROUNDS = 5
 ON_RIDGE = 0.1  # standard deviations
 TINY = 1e-300
-
-Floats = NDArray[np.float64]
 
 
 class Ridge(NamedTuple):
@@ -50,14 +50,6 @@ class _Known(NamedTuple):
         return cls(place, *local_information(problem, _unit(place)))
 
 
-class _Axes(NamedTuple):
-    """Directions across a ridge and along it, (., F), and inverse deviations (.,) of the first."""
-
-    across: Floats
-    values: Floats
-    along: Floats
-
-
 def ridge(problem: Problem, optimum: Floats, free: NDArray[np.bool_]) -> Ridge:
     """Points of the unit box that do nearly as well as the optimum (P,), itself the first.
 
@@ -68,13 +60,13 @@ def ridge(problem: Problem, optimum: Floats, free: NDArray[np.bool_]) -> Ridge:
     dimension = len(open_directions(best.rows[:, free]))
     step = STEP * dimension
     found, turn = [best], 0
-    tangents = [_axes(best, free, dimension).along]
+    tangents = [_axes(best, free, dimension)[2]]
     while dimension and turn < len(found) < MOST_POINTS:
-        for move in np.concatenate([tangents[turn], -tangents[turn]]) * step:
-            ahead = _moved(found[turn].place, free, move)
-            if _distance(ahead, found) < CLOSE * step:
-                continue
-            reached, tangent = _brought_back(problem, ahead, free, dimension, step)
+        moves = np.concatenate([tangents[turn], -tangents[turn]]) * step
+        ahead = [_moved(found[turn].place, free, move) for move in moves]
+        fresh = [place for place in ahead if _distance(place, found) >= CLOSE * step]
+        back = on_all_cores(lambda place: _brought_back(problem, place, free, dimension, step), fresh)
+        for reached, tangent in back:
             if _distance(reached.place, found) > CLOSE * step and reached.cost < best.cost + AS_HIGH:
                 found.append(reached)
                 tangents.append(tangent)
@@ -100,22 +92,22 @@ def _brought_back(
     for _ in range(ROUNDS):
         if not np.isfinite(known.cost):
             break
-        axes = _axes(known, free, dimension)
-        slope = axes.across @ (known.gradient[free] * _stretch(_unit(known.place)[free]))
-        deviations = slope / axes.values  # from the least cost, in standard deviations
+        across, inverse_deviations, along = _axes(known, free, dimension)
+        slope = across @ (known.gradient[free] * _stretch(_unit(known.place)[free]))
+        deviations = slope / inverse_deviations  # from the least cost, in standard deviations
         if np.linalg.norm(deviations) < ON_RIDGE:
-            return known, axes.along
-        move = -(deviations / axes.values) @ axes.across
+            return known, along
+        move = -(deviations / inverse_deviations) @ across
         longest = step / max(float(np.linalg.norm(move)), TINY)
         known = _Known.at(problem, _moved(known.place, free, move * min(1.0, longest)))
-    return known, _axes(known, free, dimension).along if np.isfinite(known.cost) else np.empty((0, int(free.sum())))
+    return known, _axes(known, free, dimension)[2] if np.isfinite(known.cost) else np.empty((0, int(free.sum())))
 
 
-def _axes(known: _Known, free: NDArray[np.bool_], dimension: int) -> _Axes:
-    along = _stretch(_unit(known.place)[free])
-    _, values, directions = np.linalg.svd(square(known.rows[:, free] * along))
+def _axes(known: _Known, free: NDArray[np.bool_], dimension: int) -> tuple[Floats, Floats, Floats]:
+    """Directions across the ridge (., F), their inverse standard deviations (.,), and directions along it."""
+    _, values, directions = np.linalg.svd(square(known.rows[:, free] * _stretch(_unit(known.place)[free])))
     open_from = len(values) - dimension
-    return _Axes(directions[:open_from], np.maximum(values[:open_from], TINY), directions[open_from:])
+    return directions[:open_from], np.maximum(values[:open_from], TINY), directions[open_from:]
 
 
 def _moved(place: Floats, free: NDArray[np.bool_], move: Floats) -> Floats:

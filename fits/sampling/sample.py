@@ -19,7 +19,7 @@ from fits.progress import Progress
 from fits.sampling.chain import Chain, opened
 from fits.sampling.convergence import CHECKS, Convergence, expected_steps, next_check
 from fits.sampling.ensemble import Ensemble
-from fits.sampling.initial import log_posteriors
+from fits.sampling.initial import log_posteriors, share_of
 from fits.sampling.nuts import CHAINS, Nuts, require_blackjax
 from fits.sampling.options import SamplerOptions
 from fits.sampling.posterior import Posterior, posterior_of
@@ -179,7 +179,7 @@ def identity_of(problem: Problem, walkers: int, seed: int, sampler: str = "emcee
     Of numbers the first digits, which are the same wherever they are computed.
     """
     points = 0.01 + 0.98 * qmc.Sobol(len(problem.names), scramble=False).random_base2(2)  # in the unit box
-    log_posterior = np.asarray(problem.call(log_posteriors, logit(points)), float)
+    log_posterior = log_posteriors(problem, logit(points), share_of(walkers))
     return fingerprint(
         sampler=sampler,
         walkers=walkers,

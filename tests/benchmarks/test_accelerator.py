@@ -26,7 +26,7 @@ def test_a_tiny_run_writes_whole_files_and_keeps_other_rows(tmp_path: Path) -> N
     assert [row["kind"] for row in rows] == ["value", "gradient"]
     assert any("failed" in line for line in lines)
     for row in rows:
-        assert row["apart"] < 1e-12  # the same arithmetic, on any two devices
+        assert row["difference"] < 1e-12  # the same arithmetic, on any two devices
         assert min(row["microseconds"], row["microseconds_on_processor"], row["compile_seconds"]) > 0
 
 

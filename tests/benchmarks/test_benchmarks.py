@@ -120,7 +120,7 @@ def test_a_tiny_recovery_run_writes_whole_files(tmp_path: Path) -> None:
     content = json.loads(paths[0].read_text())
     assert paths[1].read_text() == text
     assert [row["parameter"] for row in content["parameters"]] == list(recovery.TRUTH)
-    assert all(0 <= row["within"] <= 2 and 0 <= row["covered"] <= 2 for row in content["parameters"])
+    assert all(0 <= row["within_3"] <= 2 and 0 <= row["covered"] <= 2 for row in content["parameters"])
 
 
 def test_results_are_replaced_whole_or_not_at_all(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Calibration: ranks that should count as uniform do, others do not, and a killed run goes on where it was."""
+"""Calibration: ranks that should count as uniform do, others do not, and a killed run resumes."""
 
 import json
 from pathlib import Path
@@ -47,20 +47,20 @@ def test_ranks_tell_whether_posteriors_are_right(width: float, shift: float, uni
 def test_draws_come_from_the_whole_chain_after_its_burn_in() -> None:
     chain = np.arange(1000 * 12).reshape(1000, 12, 1)
     posterior = SimpleNamespace(chain=chain, burn_in=100, autocorrelation_time=np.array([2.0, 4.0]))
-    draws, apart = ranks.spread_draws(posterior)
+    draws, thinning = ranks.spread_draws(posterior)
     assert draws.shape == (ranks.DRAWS, 1)
     assert draws[0] == chain[100, 0]
     assert draws[-1, 0] == chain[999, (ranks.DRAWS - 1) % 12, 0]
-    assert apart == pytest.approx(899 / 98 * 12 / 4.0)
+    assert thinning == pytest.approx(899 / 98 * 12 / 4.0)
 
 
-def test_intervals_hold_what_they_say() -> None:
-    """Ranks that are each there once: 68 and 90 of 100 lie within, and as many are expected."""
+def test_intervals_cover_what_they_state() -> None:
+    """Ranks that are each there once: 68 and 90 of 100 are covered, and as many are expected."""
     row = ranks.judged("any", np.arange(100))
-    assert row.within == (68, 90)
-    for level, inside in zip(ranks.LEVELS, row.within, strict=True):
+    assert row.covered == (68, 90)
+    for level, covered in zip(ranks.LEVELS, row.covered, strict=True):
         low, high = ranks.expected(100, level)
-        assert low < inside < high
+        assert low < covered < high
 
 
 @pytest.mark.parametrize("name", cases.HAZE)
@@ -76,12 +76,12 @@ def test_truths_come_from_the_prior(name: str) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["bounded", "degenerate", "banana", "errors"])
+@pytest.mark.parametrize("name", ["bounded", "degenerate", "banana", "discrepancy"])
 def test_posteriors_are_run(name: str, tmp_path: Path) -> None:
     """Without all orders; free parameters stand in the order of the problem's."""
     assert tuple(cases.CASES) == POSTERIORS
     case = cases.CASES[name]
-    cheap = {"transport": CHEAP} if case.errors else {}
+    cheap = {"transport": CHEAP} if case.discrepancy else {}
     text, paths = run.study(directory=tmp_path, repeats=1, posterior=name, processes=1, **cheap)
     (record,) = json.loads(paths[0].read_text())["repeats"]
     assert len(record["truth"]) == len(record["estimate"]) == len(case.free)

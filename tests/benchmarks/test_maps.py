@@ -1,4 +1,4 @@
-"""The painted map: its readings are those of its truth, texel by texel, with the noise that it states."""
+"""The painted map: its measurements are those of its truth, texel by texel, with the noise that it states."""
 
 import numpy as np
 import pytest
@@ -21,7 +21,7 @@ def flakes() -> Painted:
         return painted(SHAPE, lj.SingleScattering(), material="flakes", seed=3)
 
 
-def test_readings_are_those_of_the_truth(flakes: Painted) -> None:
+def test_measurements_are_those_of_the_truth(flakes: Painted) -> None:
     assert flakes.values.shape == (*SHAPE, 64, 1)
     found = map_data(flakes.values, flakes.geometry)
     assert (found.shape, found.samples, found.channels) == (SHAPE, 64, 1)
@@ -45,9 +45,9 @@ def test_seeds_repeat(flakes: Painted) -> None:
 
 
 def test_what_is_free_is_what_was_painted(flakes: Painted) -> None:
-    _, names, free = split(flakes.stack)
-    assert set(names) == set(flakes.truth) == set(NAMES["flakes"])
-    for name, entry in zip(names, free, strict=True):
+    free = split(flakes.stack)[1]
+    assert set(free) == set(flakes.truth) == set(NAMES["flakes"])
+    for name, entry in free.items():
         assert entry.low < flakes.truth[name].min()
         assert entry.high > flakes.truth[name].max()
     assert flakes.noise.relative == 0.02
@@ -62,9 +62,9 @@ def test_the_coat_may_share_a_base(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(lj, "evaluate", evaluate)
     coat = painted((2, 3), noise=0.0, shared=True)
-    _, names, free = split(coat.stack)
-    assert set(names) == set(coat.truth) == {*NAMES["coat"], "base.albedo"}
-    assert [name for name, entry in zip(names, free, strict=True) if entry.same_for_all_texels] == ["base.albedo"]
+    free = split(coat.stack)[1]
+    assert set(free) == set(coat.truth) == {*NAMES["coat"], "base.albedo"}
+    assert [name for name, entry in free.items() if entry.same_for_all_texels] == ["base.albedo"]
     (stack,) = seen
     np.testing.assert_array_equal(stack.layers[0].alpha, coat.truth["layers[0].alpha"].ravel())
     np.testing.assert_array_equal(stack.layers[1].thickness[:, 0], coat.truth["layers[1].thickness"].ravel())

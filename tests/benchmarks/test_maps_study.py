@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from benchmarks.studies.maps import engines, fitting, paper
-from benchmarks.studies.maps.cases import CASES, given, job_of
+from benchmarks.studies.maps.cases import CASES, job_of, painted_map
 from benchmarks.studies.maps.fitting import PROCESSES, Row, Size, rate, warm
 from benchmarks.studies.maps.run import study
 from benchmarks.studies.maps.work import Texelwise, Timed, first_starts, peak, rows_of, scipy_fit
@@ -101,7 +101,7 @@ def test_a_tiny_run_writes_whole_files(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_scipy_begins_where_fits_of_the_map_do_and_ends_as_low() -> None:
     """A texel's cost at the truth is above both."""
-    with given(FLAKES, 8) as one:
+    with painted_map(FLAKES, 8) as one:
         _, _, found = fitting.fitted(one, replace(TINY, side=8), processes=1)
         job, tasks = job_of(one, TINY.chunk)
         asked = Texelwise(tasks[0], (3, 60))

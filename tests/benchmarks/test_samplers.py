@@ -22,7 +22,7 @@ PLAIN = samplers.Sampled(
 def test_verdicts(shift: float, effective: float, verdict: str) -> None:
     quantiles = (np.array(PLAIN.quantiles) + shift).tolist()
     other = dataclasses.replace(PLAIN, sampler="NUTS", quantiles=quantiles, effective=effective)
-    assert samplers.apart(other, PLAIN) == pytest.approx(shift)
+    assert samplers.quantile_difference(other, PLAIN) == pytest.approx(shift)
     assert samplers._row(other, PLAIN)[-1] == verdict
     assert samplers._row(PLAIN, PLAIN)[-1] == "-"
 

@@ -23,13 +23,13 @@ FIT_FILE = batch.fit_file
 
 
 @pytest.fixture(autouse=True)
-def no_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+def no_pictures(monkeypatch):
     """Other tests look at reports of single fits; in this process they are not drawn here."""
     monkeypatch.setattr(FitReport, "write", lambda _, folder: (folder / "report.html").write_text("drawn"))
 
 
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def whole(tmp_path_factory):
     """A folder with scans/, coat.toml and bare.toml, and in out/ the fits of all files by both."""
     folder = tmp_path_factory.mktemp("batch")
     make_folder(folder)
@@ -41,7 +41,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def folder(whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def folder(whole, tmp_path, monkeypatch):
     """A current directory with a copy of it, but the fits."""
     shutil.copytree(whole, tmp_path, dirs_exist_ok=True, ignore=shutil.ignore_patterns("out"))
     monkeypatch.chdir(tmp_path)
@@ -49,11 +49,11 @@ def folder(whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path
 
 
 @pytest.fixture
-def counted(whole: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
+def counted(whole, monkeypatch):
     """Which fits are made, in this process; each is a copy of the one that is there, and takes no time."""
-    made: list[str] = []
+    made = []
 
-    def copied(directory: Path, *_: object, **__: object) -> FitReport:
+    def copied(directory, *_, **__):
         made.append(f"{directory.parent.name} {directory.name}")
         shutil.copytree(whole / "out" / directory.parent.name / directory.name, directory, dirs_exist_ok=True)
         return FitReport(fits.load_fit(directory))
@@ -62,18 +62,15 @@ def counted(whole: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
     return made
 
 
-def table() -> list[dict[str, str]]:
+def table():
     with open("out/table.csv", newline="") as file:
         return list(csv.DictReader(file))
 
 
-def test_every_file_is_fitted_by_every_stack(
-    folder: Path, whole: Path, counted: list[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    calls: list[tuple[object, ...]] = []
+def test_every_file_is_fitted_by_every_stack(whole, counted, monkeypatch):
     monkeypatch.chdir(whole)
     before = contents(whole)
-    found = fits.fit_files("scans", STACKS, "out", progress=lambda *given: calls.append(given), **FEW)
+    found = fits.fit_files("scans", STACKS, "out", **FEW)
     assert not counted  # nothing is done again
     after = contents(whole)
     assert after.pop(str(whole / "out" / STORE))
@@ -116,12 +113,10 @@ def test_every_file_is_fitted_by_every_stack(
 
 
 @pytest.mark.parametrize("late", [False, True], ids=["between", "before the row is kept"])
-def test_an_interrupted_batch_resumes(
-    folder: Path, counted: list[str], monkeypatch: pytest.MonkeyPatch, late: bool
-) -> None:
+def test_an_interrupted_batch_resumes(folder, counted, late):
     fit_one, calls = batch.fit_one, []
 
-    def interrupted(job: batch.Job, task: batch.Task) -> batch.Row:
+    def interrupted(job, task):
         if len(counted) == 2 and not late:
             raise KeyboardInterrupt
         row = fit_one(job, task)
@@ -129,25 +124,23 @@ def test_an_interrupted_batch_resumes(
             raise KeyboardInterrupt
         return row
 
-    monkeypatch.setattr(batch, "fit_one", interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        fits.fit_files("scans", STACKS, "out", progress=lambda *given: calls.append(given[:3]), **FEW)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(batch, "fit_one", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            fits.fit_files("scans", STACKS, "out", progress=lambda *given: calls.append(given[:3]), **FEW)
     assert [line["status"] for line in table()].count("not done yet") == 2
     assert calls == [("fits", done, 6) for done in (2, 3, 4)]
-    monkeypatch.setattr(batch, "fit_one", fit_one)
     found = fits.fit_files("scans", STACKS, "out", **FEW)
     assert [row["result"] == "failed" for row in found.rows] == [True, True, False, False, False, False]
     assert len(counted) == 4 + late
     assert len(set(counted)) == 4
 
 
-def test_a_result_of_something_else_is_refused_by_name_and_damage_is_fitted_again(
-    folder: Path, counted: list[str]
-) -> None:
+def test_a_result_of_something_else_is_refused_by_name_and_damage_is_fitted_again(folder, counted):
     fits.fit_files("scans/paint.csv", STACKS, "out", **FEW)
     before = contents(folder / "out")
 
-    def refused(message: str, **options: object) -> None:
+    def refused(message, **options):
         with pytest.raises(ValueError, match=message):
             fits.fit_files("scans/paint.csv", STACKS, "out", **(FEW | options))
         assert contents(folder / "out") == before
@@ -173,35 +166,33 @@ def test_a_result_of_something_else_is_refused_by_name_and_damage_is_fitted_agai
         file.write("\n")
     before = contents(folder / "out")
     refused(r"\(file [0-9a-f]{8}, not")
+    (folder / "out" / STORE).unlink()
+    before = contents(folder / "out")
+    refused(r"no batch\.store of theirs\): choose another directory")
 
 
-@pytest.mark.parametrize("removed", ["coated.csv/coat", "coated.csv"])
-def test_a_result_that_is_removed_during_the_run_is_not_counted(
-    folder: Path, counted: list[str], monkeypatch: pytest.MonkeyPatch, removed: str
-) -> None:
+def test_a_result_that_is_removed_during_the_run_is_not_counted(folder, counted, monkeypatch):
+    """It had been: 6 of 6 fits were said to be there, and one was gone."""
     fit_one = batch.fit_one
 
-    def remove(job: batch.Job, task: batch.Task) -> batch.Row:
+    def remove(job, task):
         if task.key == "paint.csv/bare":  # after both of the other file
-            shutil.rmtree(job.out / removed)
+            shutil.rmtree(job.out / "coated.csv/coat")
         return fit_one(job, task)
 
+    scans = ["scans/coated.csv", "scans/paint.csv"]
     monkeypatch.setattr(batch, "fit_one", remove)
-    found = fits.fit_files(["scans/coated.csv", "scans/paint.csv"], STACKS, "out", **FEW)
-    gone = [f"{row['file']}/{row['stack']}" for row in found.rows if "was removed" in row["status"]]
-    assert gone == [one for one in ("coated.csv/coat", "coated.csv/bare") if one.startswith(removed)]
+    found = fits.fit_files(scans, STACKS, "out", **FEW)
+    assert [row["stack"] for row in found.rows if "was removed" in row["status"]] == ["coat"]
     assert not found.complete
-    assert [line["result"] == "failed" for line in table()].count(True) == len(gone)
+    assert [line["result"] for line in table()].count("failed") == 1
     monkeypatch.setattr(batch, "fit_one", fit_one)
-    assert fits.fit_files(["scans/coated.csv", "scans/paint.csv"], STACKS, "out", **FEW).complete
-    assert len(counted) == 4 + len(gone)
-    (folder / "out" / batch.STORE).unlink()
-    with pytest.raises(ValueError, match=r"no batch\.store of theirs\): choose another directory"):
-        fits.fit_files("scans/paint.csv", STACKS, "out", **FEW)
+    assert fits.fit_files(scans, STACKS, "out", **FEW).complete
+    assert len(counted) == 5
 
 
 @pytest.mark.slow
-def test_held_out_data_decide(folder: Path) -> None:
+def test_held_out_data_decide(folder):
     reading = ReadOptions(hold_out=("incidence=50",))
     found = fits.fit_files(["scans/coated.csv"], STACKS, "out", read_options=reading, **FEW)
     assert found.best == {"coated.csv": "coat"}
@@ -213,12 +204,10 @@ def test_held_out_data_decide(folder: Path) -> None:
     assert coat["loss"] == pytest.approx(-2.0 * scores.elpd * scores.count, abs=2e-3 * scores.count)
 
 
-def test_the_best_of_a_search_is_a_result_like_others(
-    folder: Path, coat_fit: fits.Fit, counted: list[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    searched: list[Path] = []
+def test_the_best_of_a_search_is_a_result_like_others(folder, coat_fit, counted, monkeypatch):
+    searched = []
 
-    def search(data: fits.Measurements, *, directory: Path, seed: int, options: SearchOptions) -> SimpleNamespace:
+    def search(data, *, directory, seed, options):
         searched.append(directory.relative_to(folder))
         assert (seed, options.layers) == (0, 1)
         return SimpleNamespace(best=SimpleNamespace(name="haze / diffuse", fit=coat_fit))
@@ -240,7 +229,7 @@ def test_the_best_of_a_search_is_a_result_like_others(
         fits.fit_files("scans/paint.csv", [], "out", search=True)
 
 
-def test_processes_give_what_threads_give(folder: Path, whole: Path) -> None:
+def test_processes_give_what_threads_give(folder, whole):
     """A worker knows nothing of the patches here: reports are drawn, where they are wanted."""
     for reports, out in ((True, "out"), (False, "plain")):
         files = ["scans/paint.csv", "scans/broken.csv"][: 1 + reports]
@@ -253,12 +242,10 @@ def test_processes_give_what_threads_give(folder: Path, whole: Path) -> None:
     assert not list(folder.glob("plain/*/*/report.html"))
 
 
-def test_what_goes_wrong_in_one_fit_ends_none_of_the_others(
-    folder: Path, counted: list[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_goes_wrong_in_one_fit_ends_none_of_the_others(folder, counted, monkeypatch):
     copied = batch.fit_file
 
-    def broken(directory: Path, *given: object, **options: object) -> object:
+    def broken(directory, *given, **options):
         if directory.parent.name == "coated.csv" and directory.name == "coat":
             raise RuntimeError("no memory\nis left")
         by = FIT_FILE if directory.parent.name == "paint.csv" and directory.name == "bare" else copied
@@ -284,23 +271,19 @@ def test_what_goes_wrong_in_one_fit_ends_none_of_the_others(
         (["empty"], STACKS, "out", "empty: holds no measurement file"),
         ([], STACKS, "out", "no file is given"),
         (["scans"], [], "out", "neither a stack nor a search is given"),
-        (["scans"], ["nowhere.toml"], "out", "no such file: 'nowhere.toml'"),
         (["scans/broken.csv"], STACKS, "out", "no file can be fitted: .*twenty"),
         (["scans", "copies"], STACKS, "out", r"scans/paint.csv and copies/paint.csv: results go by this name"),
         (["scans"], ["coat.toml", "copies/coat.toml"], "out", "results go by this name"),
         (["scans"], ["search.toml"], "out", r"search.toml: its name must be another"),
-        (["table.csv"], STACKS, "out", r"table.csv: its name must be another"),
         (["scans"], STACKS, "scans", "is not empty, and holds no fits"),
         (["scans"], STACKS, "coat.toml", "is a file"),
         (["scans"], STACKS, "no/such", "there is no directory"),
     ],
 )
-def test_bad_input_is_named_and_writes_nothing(
-    folder: Path, files: list[str], stacks: list[str], out: str, message: str
-) -> None:
+def test_bad_input_is_named_and_writes_nothing(folder, files, stacks, out, message):
     for name in ("empty", "copies"):
         (folder / name).mkdir()
-    for name in ("search.toml", "table.csv", "copies/coat.toml"):
+    for name in ("search.toml", "copies/coat.toml"):
         shutil.copy(folder / "bare.toml", folder / name)
     shutil.copy(folder / "scans" / "paint.csv", folder / "copies" / "paint.csv")
     before = contents(folder)
@@ -313,7 +296,7 @@ def test_bad_input_is_named_and_writes_nothing(
 # ---- which stack is best of a file ----
 
 
-def row(stack: str, loss: float, file: str = "a.csv", **more: object) -> batch.Row:
+def row(stack, loss, file="a.csv", **more):
     usual = {"result": "converged", "criterion": "AIC", "reduced_chi_square": 1.0, "status": ""}
     return {"file": file, "stack": stack, "loss": loss} | usual | more
 
@@ -343,7 +326,7 @@ FAILED = {"file": "a.csv", "stack": "two", "result": "failed", "status": "unread
         ([row("one", 10.0), row("two", 90.0, criterion="cube_root")], ["", ""]),
     ],
 )
-def test_stacks_of_a_file_are_ranked(rows: list[batch.Row], words: list[str]) -> None:
+def test_stacks_of_a_file_are_ranked(rows, words):
     rows = [one | ({"loss": float(one["loss"])} if "loss" in one else {}) for one in rows]
     others = [row("one", 9.0, "b.csv"), row("two", 1.0, "b.csv"), row("one", 1.0, "c")]
     ranked = batch.ranked([*rows, *others])
@@ -353,7 +336,7 @@ def test_stacks_of_a_file_are_ranked(rows: list[batch.Row], words: list[str]) ->
     assert ("a.csv" in best) == ("best" in words or len(rows) - sum(one["result"] == "failed" for one in rows) == 1)
 
 
-def test_table_page_and_sentences(tmp_path: Path) -> None:
+def test_table_page_and_sentences(tmp_path):
     some = [row("coat", 1.0, file=f"<{k}> #.csv", status="converged", seconds=1.0) for k in range(3)]
     bad = {"file": "b.csv", "stack": "coat", "result": "failed", "status": "line 2: <x> is no number"}
     rows = batch.ranked([*some, bad, row("coat", 1.0, "c.csv", result="not converged")])

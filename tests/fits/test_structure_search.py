@@ -2,7 +2,6 @@
 
 import re
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,11 +10,10 @@ import fits
 import layerjax as lj
 from fits import structure_search
 from fits._files import locked
-from fits.optimise.result import Fit
 from fits.prediction import cross_validation
 from fits.problem.compilation import cores
 from fits.problem.noise import Noise
-from fits.problem.parameters import Free, split
+from fits.problem.parameters import Free, names_of, split
 from fits.store import Store
 from fits.structure_search import STORE, Library, SearchOptions, default_library, read_library, search
 from tests.helpers.files import contents
@@ -30,27 +28,26 @@ OPTIONS, SHORT = SearchOptions(layers=1, starts=2), SearchOptions(layers=0, star
 
 
 @pytest.fixture(scope="module")
-def data() -> fits.Measurements:
+def data():
     geometry = fits.slices([10.0, 40.0, 70.0], np.arange(-75.0, 76.0, 6.0))
     return fits.simulate(TRUTH, geometry, lj.SingleScattering(), 0.01, 1e-6, seed=1)
 
 
 @pytest.fixture(scope="module")
-def directory(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def directory(tmp_path_factory):
     return tmp_path_factory.mktemp("search") / "stacks"
 
 
 @pytest.fixture(scope="module")
-def found(data: fits.Measurements, directory: Path) -> fits.Search:
+def found(data, directory):
     return search(data, LIBRARY, options=OPTIONS, directory=directory, **GIVEN)
 
 
-def test_the_stack_behind_the_data_is_found(found: fits.Search, directory: Path) -> None:
+def test_the_stack_behind_the_data_is_found(found, directory):
     assert found.best.name == "haze / diffuse"
     assert found.indistinguishable == ()
     assert found.options == OPTIONS
-    assert found.ranking == tuple(one.name for one in found.candidates)
-    assert set(found.ranking) == {"diffuse", "metal", "haze / diffuse", "haze / metal"}
+    assert {one.name for one in found.candidates} == {"diffuse", "metal", "haze / diffuse", "haze / metal"}
     assert found.probabilities["haze / diffuse"] == found.best.model_score.model_probability > 0.999
     assert sum(found.probabilities.values()) == pytest.approx(1.0)
     assert found.best.bic == 0.0
@@ -61,7 +58,7 @@ def test_the_stack_behind_the_data_is_found(found: fits.Search, directory: Path)
 
 
 @pytest.mark.slow
-def test_others_get_a_discrepancy_term(data: fits.Measurements, found: fits.Search) -> None:
+def test_others_get_a_discrepancy_term(data, found):
     ruled = search(data, LIBRARY, options=OPTIONS, **BY_RULE)
     noise = {one.name: one.fit.problem.noise.discrepancy for one in ruled.candidates}
     assert not noise["haze / diffuse"]
@@ -69,18 +66,16 @@ def test_others_get_a_discrepancy_term(data: fits.Measurements, found: fits.Sear
     assert ruled.best.name == found.best.name
 
 
-def test_a_killed_search_resumes_and_finds_the_same(
-    data: fits.Measurements, directory: Path, found: fits.Search, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_killed_search_resumes_and_finds_the_same(data, directory, found, monkeypatch):
     """Killed at the second of three incidences of one of four structures: the next run makes two, and no other."""
     whole = Store.read(directory / STORE)
     with Store.open(directory / STORE, whole.fingerprint) as store:
         for key in filter(re.compile("haze / diffuse").match, whole.keys()):
             store.put(key, None)
-    made: list[int] = []
+    made = []
     refit = cross_validation.refit
 
-    def interrupted(*given: object) -> Fit:
+    def interrupted(*given):
         made.append(1)
         if len(made) == 2:
             raise KeyboardInterrupt
@@ -91,22 +86,22 @@ def test_a_killed_search_resumes_and_finds_the_same(
         search(data, LIBRARY, options=OPTIONS, directory=directory, **GIVEN)
     again = search(data, LIBRARY, options=OPTIONS, directory=directory, **GIVEN)
     assert len(made) == 4
-    assert again.ranking == found.ranking
     for one, other in zip(again.candidates, found.candidates, strict=True):
+        assert one.name == other.name
         np.testing.assert_array_equal(one.fit.vector, other.fit.vector)
         assert one.model_score == other.model_score
     assert set(Store.read(directory / STORE).keys()) == set(whole.keys())
 
 
 @pytest.mark.parametrize("correlated", [pytest.param(0.2, marks=pytest.mark.slow), 1.0])
-def test_the_options_of_its_fits_decide_on_a_discrepancy(data: fits.Measurements, correlated: float) -> None:
+def test_the_options_of_its_fits_decide_on_a_discrepancy(data, correlated):
     """Residuals of a stack without the haze are correlated by more than 0.2, which is the default, and below 1."""
     options = replace(SHORT, fit=fits.FitOptions(autocorrelation=correlated))
     one = search(data, Library({"haze": COAT}, {"diffuse": BASE}), options=options, **BY_RULE)
     assert bool(one.best.fit.problem.noise.discrepancy) == (correlated < 1.0)
 
 
-def test_a_budget_of_time_ends_a_search_that_another_goes_on_with(data: fits.Measurements, tmp_path: Path) -> None:
+def test_a_budget_of_time_ends_a_search_that_another_goes_on_with(data, tmp_path):
     many = Library({"haze": COAT}, {f"diffuse {k}": BASE for k in range(2 * cores())})
     given = GIVEN | {"directory": tmp_path / "it"}
     short = search(data, many, options=replace(SHORT, budget=0.0), **given)
@@ -119,20 +114,18 @@ def test_a_budget_of_time_ends_a_search_that_another_goes_on_with(data: fits.Mea
     assert len(longer.candidates) == len(many.bases)
 
 
-def test_every_structure_has_the_instrument_and_another_search_is_refused(
-    data: fits.Measurements, tmp_path: Path
-) -> None:
-    instrument = fits.Instrument(detector_aperture=2.0, gain_sd=0.02)
-    given = {"data": data, "library": LIBRARY, **GIVEN, "options": SHORT, "directory": tmp_path / "it"}
-    given["instrument"] = instrument
+def test_every_structure_has_the_instrument_and_another_search_is_refused(data, tmp_path):
+    instrument = fits.Instrument(gain_sd=0.02)
+    given = {"data": data, "library": Library({"haze": COAT}, {"diffuse": BASE}), **GIVEN, "instrument": instrument}
+    given |= {"options": SHORT, "directory": tmp_path / "it"}
     for one in search(**given).candidates:
-        assert replace(one.fit.problem.instrument, rings=None) == instrument
+        assert one.fit.problem.instrument == instrument
         assert sum(name.startswith("instrument.gains") for name in one.fit.values) == 3
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "precious").touch()
     before, store = contents(tmp_path), tmp_path / "it" / STORE
 
-    def refused(message: str, **changes: object) -> None:
+    def refused(message, **changes):
         with pytest.raises(ValueError, match=message):
             search(**given | changes)
 
@@ -153,18 +146,17 @@ def test_every_structure_has_the_instrument_and_another_search_is_refused(
     ("options", "message"),
     [
         ({"layers": 9}, r"layers is 9; it must be a whole number in \[0, 6\]"),
-        ({"starts": 0}, r"starts is 0; it must be a whole number in \[1, inf\]"),
         ({"beam": 0.5}, "beam is 0.5; it must be a whole number"),
         ({"bic_gain": float("nan")}, "bic_gain is nan; it must be a finite number of at least 0"),
         ({"budget": -1.0}, "budget is -1.0; it must be a finite number of at least 0"),
     ],
 )
-def test_bad_options_are_refused(options: dict[str, float], message: str) -> None:
+def test_bad_options_are_refused(options, message):
     with pytest.raises(ValueError, match=message):
         SearchOptions(**options)
 
 
-def test_it_is_reported_with_one_verdict(found: fits.Search, tmp_path: Path) -> None:
+def test_it_is_reported_with_one_verdict(found, tmp_path):
     """BIC, weight and probability had said one thing, and the score another."""
     table = structure_search.search_table(found)
     assert table.rows[0][0] == "haze / diffuse"
@@ -189,28 +181,25 @@ def test_it_is_reported_with_one_verdict(found: fits.Search, tmp_path: Path) -> 
 # ---- libraries ----
 
 
-def test_stacks_are_put_together_from_the_top() -> None:
+def test_stacks_of_the_default_are_put_together_from_the_top():
     library = default_library()
     stack = library.stack(("haze", "interface", "pigment"))
     assert [type(layer).__name__ for layer in stack.layers] == ["Medium", "Interface", "Medium"]
     assert stack.base is None
     assert library.stack(("metal",)).base is library.bases["metal"].base
-
-
-@pytest.mark.parametrize("channels", [1, 3])
-def test_every_part_of_the_default_is_free_and_has_as_many_colours(channels: int) -> None:
-    library = default_library(channels)
-    for base in library.bases:
-        assert all(split(library.stack((layer, base)))[1] for layer in library.layers)
-    names = split(library.stack(("particles", "diffuse")))[1]
-    assert sum("albedo" in name for name in names) == 2 * channels
+    for channels in (1, 3):  # every part is free, and has as many colours
+        library = default_library(channels)
+        for base in library.bases:
+            assert all(split(library.stack((layer, base)))[1] for layer in library.layers)
+        names = names_of(split(library.stack(("particles", "diffuse")))[1])
+        assert sum("albedo" in name for name in names) == 2 * channels
 
 
 INTERFACE = '[layers.coat]\nkind = "Interface"\nior = { start = 1.5, low = 1.1, high = 2.0 }\nalpha = 0.3\n'
 DIFFUSE = '[bases.diffuse]\nkind = "Lambertian"\nalbedo = { start = 0.2, low = 0.0, high = 1.0 }\n'
 
 
-def test_a_file_says_the_same(tmp_path: Path) -> None:
+def test_a_file_says_the_same(tmp_path):
     deep = '[[bases.deep.layers]]\nkind = "Medium"\nthickness = 50.0\nalbedo = 0.5\n'
     (tmp_path / "library.toml").write_text(INTERFACE + DIFFUSE + deep)
     library = read_library(tmp_path / "library.toml")
@@ -228,23 +217,13 @@ def test_a_file_says_the_same(tmp_path: Path) -> None:
         (INTERFACE.replace("alpha", "alhpa"), "alhpa"),
         ('[bases.flat]\nkind = "Lambertian"\n' + INTERFACE, "bases.flat"),
         ("[stack]\n", "stack"),
+        (INTERFACE + DIFFUSE.replace("diffuse", "coat"), "'coat' and 'coat' are one name as files"),
+        (INTERFACE + DIFFUSE + DIFFUSE.replace("diffuse", "Diffuse"), "'diffuse' and 'Diffuse' are one name as files"),
+        (INTERFACE.replace("coat", '"a/b"') + DIFFUSE, "'a/b' is no name"),
     ],
 )
-def test_bad_files_are_refused(tmp_path: Path, text: str, message: str) -> None:
+def test_bad_files_are_refused(tmp_path, text, message):
     (tmp_path / "library.toml").write_text(text)
     with pytest.raises(ValueError, match=message) as caught:
         read_library(tmp_path / "library.toml")
     assert str(caught.value).startswith(str(tmp_path / "library.toml"))
-
-
-@pytest.mark.parametrize(
-    ("layers", "bases", "message"),
-    [
-        (("a",), ("a",), "'a' and 'a' are one name as files"),
-        (("a/b",), ("c",), "'a/b' is no name"),
-        (("a",), ("b c", "B-c"), "'b c' and 'B-c' are one name as files"),
-    ],
-)
-def test_bad_names_are_refused(layers: tuple[str, ...], bases: tuple[str, ...], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        Library(dict.fromkeys(layers, COAT), dict.fromkeys(bases, BASE))

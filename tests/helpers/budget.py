@@ -14,7 +14,7 @@ BUDGET: dict[str, int] = {
     "tests/benchmarks": 300,
     "tests/fits/data": 150,
     "tests/fits/exports": 400,
-    "tests/fits/optimise": 1200,
+    "tests/fits/optimise": 1000,
     "tests/fits/prediction": 800,
     "tests/fits/problem": 1600,
     "tests/fits/sampling": 250,

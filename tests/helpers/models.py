@@ -1,15 +1,19 @@
 """Small models with known answers: data at given directions, and functions that stand in for a transport."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
+from fits.data.geometry import Pairs
 from fits.data.measurements import Measurements
 from fits.optimise.fit import fit
 from fits.optimise.result import Fit
+from fits.problem.noise import Noise
 from fits.problem.parameters import Free
+from fits.problem.problem import Problem
 
 
 def directions(count: int, seed: int, lowest_cosine: float = 0.2) -> np.ndarray:
@@ -34,6 +38,15 @@ def measured(values: ArrayLike, sigma: ArrayLike | None = None, mask: ArrayLike 
     )
 
 
+def along(
+    geometry: Pairs, values: ArrayLike = 1.0, sigma: ArrayLike | None = None, channels: Sequence[str] = ("value",)
+) -> Measurements:
+    """Values (N, C) along the directions of a geometry, all of them used."""
+    shape = len(geometry), len(channels)
+    values, sigma = (None if one is None else np.broadcast_to(one, shape) for one in (values, sigma))
+    return Measurements(geometry.wi, geometry.wo, values, sigma, np.ones(len(geometry), bool), tuple(channels))
+
+
 def line(stack: Any, wi: Any, wo: Any) -> Any:
     """a + b cos(theta_o), one channel: linear in its parameters, so that every answer is known."""
     return (stack["a"] + stack["b"] * wo[:, 2])[:, None]
@@ -42,6 +55,13 @@ def line(stack: Any, wi: Any, wo: Any) -> Any:
 def design(count: int) -> np.ndarray:
     """The columns of `line` at the directions of `measured`."""
     return np.stack([np.ones(count), directions(count, 2)[:, 2]], axis=-1)
+
+
+def drawn_discrepancy(problem: Problem, vector: ArrayLike, generator: np.random.Generator) -> np.ndarray:
+    """A draw of the model discrepancy of the logarithms of a problem's data, (N, 1), with these parameters."""
+    process = problem.model.process
+    white = generator.standard_normal((1, len(process.where)))
+    return np.asarray(process.sample(white, problem.build(vector).correlation))
 
 
 COUNT = 100
@@ -58,6 +78,12 @@ def line_data(sigma: float = 0.05, seed: int = 0) -> Measurements:
 def line_fit(seed: int = 0) -> Fit:
     """The fit of a line to `line_data`."""
     return fit(LINE, line_data(seed=seed), transport=line, starts=2)
+
+
+def student_fit() -> Fit:
+    """The fit of a line, the level of its noise, and tails of Student's."""
+    noise = Noise(relative=0.0, floor=Free(0.1, 1e-3, 1.0), tails="student")
+    return fit(LINE, measured(line_data().values), transport=line, noise=noise, starts=4)
 
 
 def lobe(stack: Any, wi: Any, wo: Any) -> Any:

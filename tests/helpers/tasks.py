@@ -89,9 +89,15 @@ def surroundings(shared: Any, task: Any) -> dict[str, Any]:
 
 @contextmanager
 def started(words: list[str], *paths: Path) -> Iterator[subprocess.Popen[str]]:
-    """A program of Python in a process group of its own, with these paths to import from; killed in the end."""
+    """A program of Python in a process group of its own, with these paths to import from; killed in the end.
+
+    It finds the programs that tests have compiled, and adds none: it may be killed as it writes one.
+    """
+    import jax
+
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(map(str, (*paths, ROOT)))}
-    environment |= {"DASK_LOGGING__DISTRIBUTED": "critical"}
+    environment |= {"DASK_LOGGING__DISTRIBUTED": "critical", "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "inf"}
+    environment["JAX_COMPILATION_CACHE_DIR"] = str(jax.config.values["jax_compilation_cache_dir"])
     before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a background job's ignoring is inherited
     try:
         pipes: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}

@@ -63,7 +63,7 @@ def ruled(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=pytest.mark.slow if name == "slab" else ()) for name in STACKS]
+    "name", [pytest.param(name, marks=() if name == "haze" else pytest.mark.slow) for name in STACKS]
 )
 def test_gradients_are_those_within_jit(name, ruled):
     function = total(name)
@@ -104,15 +104,13 @@ def test_a_gradient_by_one_number_agrees_with_differences(number):
 
 
 def test_derivatives_of_derivatives(ruled):
-    """One within the other, and by one number after the other, are as within jit."""
+    """One within the other, and twice by one number, are as within jit."""
 
     def function(albedo, thickness):
         return total("haze")({"base": albedo, "thickness": thickness})
 
     mixed = jax.grad(lambda albedo: jax.grad(function, 1)(albedo, 0.7))
-    other = jax.grad(lambda albedo: jax.grad(lambda thickness: function(albedo, thickness))(0.7))
     same(mixed(0.4), jax.jit(mixed)(0.4), 1e-9)
-    same(other(0.4), jax.jit(other)(0.4), 1e-9)
     hessian = jax.hessian(lambda albedo: function(albedo, 0.7))
     same(hessian(0.4), jax.jit(hessian)(0.4), 1e-9)
 

@@ -1,3 +1,3 @@
-"""A GPU beside the processor: the same programs on both, their times and how far what they find is apart."""
+"""A GPU beside the processor: the same programs on both, their times and the differences of their results."""
 
 from benchmarks.studies.accelerator.run import study as study

@@ -23,18 +23,18 @@ FLOOR = 1e-3
 
 @dataclass(frozen=True)
 class Measured:
-    """Seconds of a run on the device and on the processor, to compile for the device, and how far results are apart."""
+    """Seconds of a run on the device and on the processor, and to compile for the device; the difference of results."""
 
     seconds: float
     seconds_on_processor: float
     compile_seconds: float
-    apart: float
+    difference: float
 
 
 def measured(
-    tasks: Sequence[Task], rounds: int, report: Callable[[str], None], found: Callable[[Task, Measured], None]
+    tasks: Sequence[Task], rounds: int, report: Callable[[str], None], collect: Callable[[Task, Measured], None]
 ) -> None:
-    """Compile these side by side, and give `found` what each takes, in turn; those that fail are told of and left out.
+    """Compile these side by side, and measure one after the other: `collect` gets each result; failures are reported.
 
     The devices of a process begin without the memory of all others: XLA_PYTHON_CLIENT_PREALLOCATE must be "false".
     """
@@ -42,11 +42,11 @@ def measured(
     began: list[tuple[Task, BaseProcess, Connection]] = []
     try:
         for task in tasks:
-            here, there = context.Pipe()
-            process: BaseProcess = context.Process(target=_work, args=(there, task, rounds), daemon=True)
+            ours, theirs = context.Pipe()
+            process: BaseProcess = context.Process(target=_work, args=(theirs, task, rounds), daemon=True)
             process.start()
-            there.close()  # or the end of the process would not be one of the pipe
-            began.append((task, process, here))
+            theirs.close()  # or the end of the process would not be one of the pipe
+            began.append((task, process, ours))
         ready = []
         for task, _, pipe in began:
             try:
@@ -57,7 +57,7 @@ def measured(
         for task, pipe in ready:
             try:
                 pipe.send("measure")
-                found(task, pipe.recv())
+                collect(task, pipe.recv())
             except (EOFError, BrokenPipeError):
                 report(f"{task.name}, {task.precision}, {task.kind}: failed to run")
     finally:
@@ -68,36 +68,36 @@ def measured(
 
 
 def _work(pipe: Connection, task: Task, rounds: int) -> None:
-    """Compile for both devices, tell the longer time, and measure when told to."""
+    """Compile for both devices, send the longer time, and measure on request."""
     jax.config.update("jax_enable_x64", True)
     places = jax.devices()[0], jax.devices("cpu")[0]
     with ThreadPoolExecutor() as pool:
         compiled = list(pool.map(lambda place: _compiled(task, place), places))
     pipe.send(max(seconds for _, _, seconds in compiled))
     pipe.recv()
-    (here, time_here), (there, time_there) = (
-        _run(place, work, given, rounds) for place, (work, given, _) in zip(places, compiled, strict=True)
+    (results, seconds), (reference, reference_seconds) = (
+        _run(place, work, inputs, rounds) for place, (work, inputs, _) in zip(places, compiled, strict=True)
     )
-    apart = max(map(_apart, here, there))
-    pipe.send(Measured(time_here, time_there, compiled[0][2], apart))
+    difference = max(map(_largest_difference, results, reference))
+    pipe.send(Measured(seconds, reference_seconds, compiled[0][2], difference))
 
 
 def _compiled(task: Task, place: jax.Device) -> tuple[Callable[..., Any], tuple[Any, ...], float]:
     with jax.default_device(place):
-        given = arguments(task)
-        work, seconds = timing.compiled(program(task), given)
-        return work, given, seconds
+        inputs = arguments(task)
+        work, seconds = timing.compiled(program(task), inputs)
+        return work, inputs, seconds
 
 
 def _run(
-    place: jax.Device, work: Callable[..., Any], given: tuple[Any, ...], rounds: int
+    place: jax.Device, work: Callable[..., Any], inputs: tuple[Any, ...], rounds: int
 ) -> tuple[list[np.ndarray], float]:
-    """What a program finds, and the median time of the runs after the first."""
+    """The results of a program, and the median time of the runs after the first."""
     with jax.default_device(place):
-        found, _, seconds = timing.first_and_again(timing.waiting(work, given), rounds)
-        return [np.asarray(leaf) for leaf in jax.tree.leaves(found)], seconds
+        results, _, seconds = timing.cold_and_warm(timing.waiting(work, inputs), rounds)
+        return [np.asarray(leaf) for leaf in jax.tree.leaves(results)], seconds
 
 
-def _apart(here: np.ndarray, there: np.ndarray) -> float:
-    size = np.maximum(np.abs(there), FLOOR * np.max(np.abs(there)))
-    return float(np.max(np.abs(here - there) / np.where(size > 0, size, 1.0)))
+def _largest_difference(values: np.ndarray, reference: np.ndarray) -> float:
+    scale = np.maximum(np.abs(reference), FLOOR * np.max(np.abs(reference)))
+    return float(np.max(np.abs(values - reference) / np.where(scale > 0, scale, 1.0)))

@@ -12,7 +12,7 @@ import jax
 from benchmarks.measuring import environment, timing
 from benchmarks.measuring.writing import DIRECTORY, environment_lines, figure, table, write
 from benchmarks.studies.accelerator.processes import FLOOR, Measured, measured
-from benchmarks.studies.accelerator.tasks import READINGS, TASKS, Task
+from benchmarks.studies.accelerator.tasks import MEASUREMENTS, TASKS, Task
 from fits.problem.compilation import cores
 
 NAME = "accelerator"
@@ -22,19 +22,19 @@ TEXT = """\
 
 {environment}
 The same programs on the device and on the processor of its machine, as one device of JAX (one core, where work runs in
-chunks), medians of up to {rounds} rounds (one, where it takes {long:g} s), everything compiled, results left where they
-were found. The line above tells of the run on {device}; rows of other devices are of runs of their own.
+chunks), medians of up to {rounds} rounds (one, where it takes {long:g} s), everything compiled, results left on the
+device that computes them. The line above describes the run on {device}; rows of other devices are of runs of their own.
 An *item* is a texel with a stack and a pair of directions of its own, a pair of directions of one stack, or a stack at
-{readings} pairs that all share (a batch of fits). *gradient*: a value with the derivatives of a mean squared difference
-in all parameters. *compile*: seconds on the device, others compiling beside it. *apart*: the largest difference of
-device and processor, relative to the value or to {floor:g} of the largest.
+{measurements} pairs that are the same for all (a batch of fits). *gradient*: a value with the derivatives of a mean
+squared difference in all parameters. *compile*: seconds on the device, others compiling beside it. *difference*: the
+largest of device and processor, relative to the value or to {floor:g} of the largest.
 
 {rows}"""
 
 
 @dataclass(frozen=True)
 class Row:
-    """A program on both devices: microseconds an item, and how far results are apart."""
+    """A program on both devices: microseconds an item, and the difference of results."""
 
     device: str
     task: str
@@ -45,7 +45,7 @@ class Row:
     microseconds: float
     microseconds_on_processor: float
     compile_seconds: float | None
-    apart: float
+    difference: float
 
     @property
     def what(self) -> tuple[str, ...]:
@@ -71,7 +71,7 @@ def study(
     os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")  # the first process would take the whole device
     device = jax.devices()[0].device_kind
     surroundings = environment.describe()
-    rows = _held(directory)
+    rows = _stored(directory)
 
     def written() -> tuple[str, tuple[Path, Path]]:
         text = TEXT.format(
@@ -79,7 +79,7 @@ def study(
             device=device,
             rounds=rounds,
             long=timing.LONG,
-            readings=READINGS,
+            measurements=MEASUREMENTS,
             floor=FLOOR,
             rows=table(HEADER, [_cells(row) for row in rows.values()]),
         )
@@ -87,25 +87,28 @@ def study(
             NAME, {"environment": surroundings, "rows": [asdict(row) for row in rows.values()]}, text, directory
         )
 
-    def found(task: Task, times: Measured) -> None:
+    def collect(task: Task, times: Measured) -> None:
         row = _row(device, task, times)
         rows[row.what] = row
-        report(f"{task.name}, {task.precision}, {task.kind}: {figure(row.microseconds)} us, apart by {row.apart:.1e}")
+        report(
+            f"{task.name}, {task.precision}, {task.kind}: {figure(row.microseconds)} us, "
+            f"difference {row.difference:.1e}"
+        )
         written()
 
     if quick:
         tasks = [replace(task, items=max(1, task.items // 100)) for task in tasks]
     together = together or cores()
     for first in range(0, len(tasks), together):
-        measured(tasks[first : first + together], rounds, report, found)
+        measured(tasks[first : first + together], rounds, report, collect)
     return written()
 
 
-def _held(directory: Path) -> dict[tuple[str, ...], Row]:
+def _stored(directory: Path) -> dict[tuple[str, ...], Row]:
     """The rows of the file, by what they measure."""
     path = directory / f"{NAME}.json"
-    held = [Row(**entry) for entry in json.loads(path.read_text())["rows"]] if path.exists() else []
-    return {row.what: row for row in held}
+    rows = [Row(**entry) for entry in json.loads(path.read_text())["rows"]] if path.exists() else []
+    return {row.what: row for row in rows}
 
 
 def _row(device: str, task: Task, times: Measured) -> Row:
@@ -119,12 +122,12 @@ def _row(device: str, task: Task, times: Measured) -> Row:
         microseconds=1e6 * times.seconds / task.items,
         microseconds_on_processor=1e6 * times.seconds_on_processor / task.items,
         compile_seconds=times.compile_seconds,
-        apart=times.apart,
+        difference=times.difference,
     )
 
 
 HEADER = ("task", "transport", "type", "program", "device", "items", "us", "processor, us", "ratio", "compile, s",
-          "apart")  # fmt: skip
+          "difference")  # fmt: skip
 
 
 def _cells(row: Row) -> tuple[Any, ...]:
@@ -139,5 +142,5 @@ def _cells(row: Row) -> tuple[Any, ...]:
         figure(row.microseconds_on_processor),
         figure(row.microseconds_on_processor / row.microseconds),
         "-" if row.compile_seconds is None else f"{row.compile_seconds:.0f}",
-        f"{row.apart:.1e}",
+        f"{row.difference:.1e}",
     )

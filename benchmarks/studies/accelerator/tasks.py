@@ -1,4 +1,4 @@
-"""What is asked of both devices: materials, batches of them, and the programs for a value and for a gradient."""
+"""What both devices compute: materials, batches of them, and the programs for a value and for a gradient."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -15,8 +15,8 @@ from benchmarks.suite.scenes import pairs
 BRIGHTER = 1.1
 """The loss is the mean squared difference from the values times this."""
 
-READINGS = 20
-"""Pairs of directions that every stack of a batch of fits is asked for."""
+MEASUREMENTS = 20
+"""Pairs of directions of every stack in a batch of fits."""
 
 Batch = Literal["texels", "pairs", "fits"]
 Kind = Literal["value", "gradient"]
@@ -55,12 +55,12 @@ class Task:
 
     @property
     def name(self) -> str:
-        """As it stands in the table."""
+        """The name as it stands in the table."""
         return f"{self.material}, {self.batch}"
 
     @property
     def transport(self) -> lj.Transport:
-        """Of the material."""
+        """The transport of the material."""
         return KNOWN[self.material].transport
 
 
@@ -80,7 +80,7 @@ TASKS = tuple(
     for kind in _KINDS
     if kind == "value" or not KNOWN[material].transport.random
 )
-"""What is measured, the most telling first."""
+"""What is measured, the most informative first."""
 
 
 def program(task: Task) -> Callable[..., Any]:
@@ -95,8 +95,8 @@ def program(task: Task) -> Callable[..., Any]:
         return lj.evaluate(build(maps), wi, wo, transport, side="reflection", key=key)
 
     def loss(maps: dict[str, Array], wi: Array, wo: Array) -> Array:
-        found = values(maps, wi, wo)
-        return jnp.mean((found - BRIGHTER * jax.lax.stop_gradient(found)) ** 2)
+        bsdf = values(maps, wi, wo)
+        return jnp.mean((bsdf - BRIGHTER * jax.lax.stop_gradient(bsdf)) ** 2)
 
     return values if task.kind == "value" else jax.grad(loss)
 
@@ -106,8 +106,8 @@ def arguments(task: Task) -> tuple[Any, ...]:
     maps = _maps(task, 1 if task.batch == "pairs" else task.items)
     if task.batch == "pairs":
         maps = {name: values[0] for name, values in maps.items()}
-    asked = READINGS if task.batch == "fits" else task.items
-    wi, wo = (jnp.asarray(w.astype(task.precision)) for w in pairs(asked, "reflection"))
+    count = MEASUREMENTS if task.batch == "fits" else task.items
+    wi, wo = (jnp.asarray(w.astype(task.precision)) for w in pairs(count, "reflection"))
     if task.batch == "fits":
         wi, wo = wi[:, None], wo[:, None]
     return {name: jnp.asarray(value) for name, value in maps.items()}, wi, wo

@@ -1,4 +1,4 @@
-"""Posteriors that are calibrated: which materials, readings and priors, and in what their posteriors are difficult."""
+"""The cases of the calibration: materials, geometry and priors, and what makes each posterior difficult."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -8,7 +8,7 @@ import numpy as np
 
 import fits
 import layerjax as lj
-from benchmarks.studies.calibration import shared
+from benchmarks.studies.calibration import discrepancy
 from benchmarks.suite import coated_haze
 
 HAZE = {
@@ -17,7 +17,7 @@ HAZE = {
     "thickness": fits.Free(1.0, 0.1, 10.0, fits.LogNormal(1.0, 0.4)),
     "g": fits.Free(0.5, -0.2, 0.95, fits.Normal(0.5, 0.1)),
 }
-"""Priors that end more than four standard deviations inside their bounds: no posterior leans on one."""
+"""Priors that end more than four standard deviations inside their bounds: no posterior reaches one."""
 
 FLOOR = 1e-6
 
@@ -26,9 +26,9 @@ FLOOR = 1e-6
 class Case:
     """A kind of posterior.
 
-    name: of the files. words: what the material is, a sentence or two. free: what is drawn and found, in the order of
-    the problem's parameters. stack: of numbers or of `Free`, by name. noise: relative. errors: whether readings share
-    errors as well, whose numbers are the last of `free`. scale: whether the factor of the calibration is one of `free`.
+    name: of the files. words: what the material is, a sentence or two. free: what is drawn and fitted, in the order of
+    the problem's parameters. stack: of numbers or of `Free`, by name. noise: relative. discrepancy: whether the data
+    have a model discrepancy, whose parameters are the last of `free`. scale: whether the global scale is one of `free`.
     """
 
     name: str
@@ -37,22 +37,22 @@ class Case:
     labels: Mapping[str, str]
     stack: Callable[[Mapping[str, Any]], lj.Stack]
     transport: lj.Transport
-    readings: fits.Geometry
+    geometry: fits.Geometry
     noise: float
     most_steps: int = 5000
-    errors: bool = False
+    discrepancy: bool = False
     scale: bool = False
     settings: Mapping[str, Any] = field(default_factory=dict)
 
     @property
-    def own(self) -> dict[str, fits.Free]:
-        """What is free in the stack alone."""
-        beside = {"scale", *(shared.FREE if self.errors else ())}
-        return {name: free for name, free in self.free.items() if name not in beside}
+    def of_stack(self) -> dict[str, fits.Free]:
+        """The free parameters of the stack."""
+        others = {"scale", *(discrepancy.FREE if self.discrepancy else ())}
+        return {name: free for name, free in self.free.items() if name not in others}
 
 
-def _haze(own: Mapping[str, Any]) -> lj.Stack:
-    return coated_haze.stack_of({**coated_haze.PARAMETERS, **own})
+def _haze(p: Mapping[str, Any]) -> lj.Stack:
+    return coated_haze.stack_of({**coated_haze.PARAMETERS, **p})
 
 
 HAZE_WORDS = """\
@@ -69,26 +69,26 @@ ALL_ORDERS = Case(
     labels=LABELS,
     stack=_haze,
     transport=lj.AddingDoubling(nodes=6, modes=6),
-    readings=coated_haze.readings(),
+    geometry=coated_haze.goniometer_slices(),
     noise=0.05,
     settings={"parameters": coated_haze.PARAMETERS},
 )
 
-ERRORS = Case(
-    name="calibration-errors",
+DISCREPANCY = Case(
+    name="calibration-discrepancy",
     words=HAZE_WORDS
-    + """ Readings share errors of their logarithm as well, drawn from a
-process whose numbers are drawn from their priors, by dense matrices; the fit finds these numbers.""",
-    free=HAZE | shared.FREE,
-    labels=LABELS | shared.LABELS,
+    + """ The data have a model discrepancy as well: a Gaussian
+process of their logarithm, drawn by dense matrices, with parameters that are drawn from their priors and fitted.""",
+    free=HAZE | discrepancy.FREE,
+    labels=LABELS | discrepancy.LABELS,
     stack=_haze,
     transport=lj.AddingDoubling(nodes=6, modes=6),
-    readings=coated_haze.readings(),
-    noise=0.02,  # beside the errors: these are of logarithms, in which noise is not quite normal
-    errors=True,
+    geometry=coated_haze.goniometer_slices(),
+    noise=0.02,  # small: the discrepancy is of logarithms, in which noise is not quite normal
+    discrepancy=True,
     settings={
         "parameters": coated_haze.PARAMETERS,
-        "errors": {name: repr(free) for name, free in shared.FREE.items()},
+        "discrepancy": {name: repr(free) for name, free in discrepancy.FREE.items()},
     },
 )
 
@@ -105,11 +105,9 @@ the bounds.""",
         "g": fits.Free(0.2, -0.6, 0.6),
     },
     labels={"thickness": "thickness", "albedo": "albedo", "g": "asymmetry g"},
-    stack=lambda own: lj.Stack(
-        [lj.Medium(own["thickness"], own["albedo"], lj.HenyeyGreenstein(own["g"]))], lj.Lambertian(0.0)
-    ),
+    stack=lambda p: lj.Stack([lj.Medium(p["thickness"], p["albedo"], lj.HenyeyGreenstein(p["g"]))], lj.Lambertian(0.0)),
     transport=lj.SingleScattering(),
-    readings=FEW,
+    geometry=FEW,
     noise=0.2,
     most_steps=20000,
 )
@@ -117,13 +115,13 @@ the bounds.""",
 DEGENERATE = Case(
     name="calibration-degenerate",
     words="""\
-Paint by an instrument whose calibration is unknown: the data depend on the product of albedo and factor alone, a ridge
-without an end but the bounds.""",
+Paint by an instrument whose calibration is unknown: the data depend on the product of albedo and global scale alone, a
+ridge that only the bounds end.""",
     free={"albedo": fits.Free(0.5, 0.1, 1.0), "scale": fits.Free(1.0, 0.5, 2.0)},
-    labels={"albedo": "albedo", "scale": "calibration"},
-    stack=lambda own: lj.Stack([], lj.Lambertian(own["albedo"])),
+    labels={"albedo": "albedo", "scale": "scale"},
+    stack=lambda p: lj.Stack([], lj.Lambertian(p["albedo"])),
     transport=lj.SingleScattering(),
-    readings=FEW,
+    geometry=FEW,
     noise=0.1,
     most_steps=20000,
     scale=True,
@@ -132,22 +130,22 @@ without an end but the bounds.""",
 BOUNDED = Case(
     name="calibration-bounded",
     words="""\
-A rough diffuse surface (Oren-Nayar) by few and noisy readings: roughness and albedo are known so badly that posteriors
-lean on the bounds, 0 and 1, most of the time.""",
+A rough diffuse surface (Oren-Nayar) with few and noisy measurements: roughness and albedo are identified so weakly that
+most posteriors reach their bounds, 0 and 1.""",
     free={"albedo": fits.Free(0.5, 0.0, 1.0), "roughness": fits.Free(0.5, 0.0, 1.0)},
     labels={"albedo": "albedo", "roughness": "roughness"},
-    stack=lambda own: lj.Stack([], lj.OrenNayar(own["albedo"], own["roughness"])),
+    stack=lambda p: lj.Stack([], lj.OrenNayar(p["albedo"], p["roughness"])),
     transport=lj.SingleScattering(),
-    readings=FEW,
+    geometry=FEW,
     noise=0.5,
     most_steps=20000,
 )
 
 CASES = {
     "haze": ALL_ORDERS,
-    "errors": ERRORS,
+    "discrepancy": DISCREPANCY,
     "banana": BANANA,
     "degenerate": DEGENERATE,
     "bounded": BOUNDED,
 }
-"""By what the command line calls them."""
+"""The cases by their names on the command line."""

@@ -23,7 +23,8 @@ LEVELS = (0.68, 0.9)
 """Of central intervals of posteriors: whole numbers of ranks."""
 
 LEAST_P = 0.01
-BAND = 0.99
+INTERVAL = 0.99
+"""Probability that a bar of uniform ranks lies in the interval of the picture."""
 
 COLUMNS = 4
 """Panels of the picture in a row, at most."""
@@ -35,8 +36,8 @@ Floats = NDArray[np.float64]
 @dataclass(frozen=True)
 class Row:
     """Uniformity of the ranks of one parameter: the statistic and p-value of a chi-square test over `bins`, and that of
-    Kolmogorov and Smirnov; the mean rank in standard errors from where it should be; and how many truths lie within
-    central intervals, see `LEVELS`."""
+    Kolmogorov and Smirnov; the mean rank in standard errors from where it should be; and how many truths the central
+    intervals cover, see `LEVELS`."""
 
     parameter: str
     bins: int
@@ -44,20 +45,20 @@ class Row:
     p_chi_square: float
     p_kolmogorov_smirnov: float
     mean_off: float
-    within: tuple[int, ...]
+    covered: tuple[int, ...]
     uniform: bool
 
 
 def spread_draws(posterior: fits.Posterior) -> tuple[Floats, float]:
-    """`DRAWS` draws (DRAWS, P), and after how many of the longest autocorrelation times one walker is asked again.
+    """`DRAWS` draws (DRAWS, P), and the thinning of a walker in units of the longest autocorrelation time.
 
     They are spread evenly over the chain after its burn-in, each of another walker than the last.
     """
-    kept = posterior.chain[posterior.burn_in :]
-    steps, walkers, _ = kept.shape
+    chain = posterior.chain[posterior.burn_in :]
+    steps, walkers, _ = chain.shape
     chosen = np.linspace(0, steps - 1, DRAWS).round().astype(int)
-    apart = (steps - 1) / (DRAWS - 1) * walkers
-    return kept[chosen, np.arange(DRAWS) % walkers], float(apart / np.max(posterior.autocorrelation_time))
+    thinning = (steps - 1) / (DRAWS - 1) * walkers
+    return chain[chosen, np.arange(DRAWS) % walkers], float(thinning / np.max(posterior.autocorrelation_time))
 
 
 def ranks_of(truth: Floats, draws: Floats) -> list[int]:
@@ -72,19 +73,19 @@ def judged(parameter: str, ranks: Ranks) -> Row:
     share = (ranks + 0.5) / (DRAWS + 1)
     p_ks = stats.kstest(share, "uniform").pvalue
     off = (np.mean(share) - 0.5) * np.sqrt(12.0 * len(ranks))
-    within = tuple(int(np.sum(np.abs(share - 0.5) < 0.5 * level)) for level in LEVELS)
+    covered = tuple(int(np.sum(np.abs(share - 0.5) < 0.5 * level)) for level in LEVELS)
     uniform = min(p, p_ks) > LEAST_P
-    return Row(parameter, len(counts), float(chi_square), float(p), float(p_ks), float(off), within, bool(uniform))
+    return Row(parameter, len(counts), float(chi_square), float(p), float(p_ks), float(off), covered, bool(uniform))
 
 
 def expected(repeats: int, level: float) -> tuple[float, float]:
-    """How many truths a central interval should hold: the central 95 % of the binomial distribution."""
+    """How many truths a central interval should cover: the central 95 % of the binomial distribution."""
     low, high = stats.binom.interval(0.95, repeats, level)
     return float(low), float(high)
 
 
 def picture(ranks: Mapping[str, Ranks]) -> Figure:
-    """A histogram of ranks for each parameter by its label, with the band that holds 99 % of the bars if uniform."""
+    """A histogram of ranks for each parameter by its label, with the 99 % interval of the bars of uniform ranks."""
     with mpl.rc_context(STYLE):
         columns = min(COLUMNS, len(ranks))
         rows = -(-len(ranks) // columns)
@@ -92,14 +93,14 @@ def picture(ranks: Mapping[str, Ranks]) -> Figure:
         panels = figure.subplots(rows, columns, sharey=True, squeeze=False).ravel()
         for panel in panels[len(ranks) :]:
             panel.remove()
-        for panel, (label, found) in zip(panels, ranks.items(), strict=False):
-            counts = _counts(found)
+        for panel, (label, chosen) in zip(panels, ranks.items(), strict=False):
+            counts = _counts(chosen)
             edges = np.linspace(0, DRAWS + 1, len(counts) + 1)
-            low, high = stats.binom.interval(BAND, len(found), 1 / len(counts))
+            low, high = stats.binom.interval(INTERVAL, len(chosen), 1 / len(counts))
             panel.stairs(counts, edges, fill=True, color=CYCLE[0], alpha=0.75)
             for level in (low, high):
                 panel.axhline(level, color=INK, linewidth=0.8, linestyle="dashed")
-            panel.axhline(len(found) / len(counts), color=INK, linewidth=0.8)
+            panel.axhline(len(chosen) / len(counts), color=INK, linewidth=0.8)
             panel.grid(visible=False)
             panel.set(title=label, xlim=(0, DRAWS + 1), ylim=(0, None))
         figure.supxlabel(f"rank of the truth among {DRAWS} draws", size=9)

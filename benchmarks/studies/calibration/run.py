@@ -16,8 +16,9 @@ import fits
 import layerjax as lj
 from benchmarks.measuring import environment
 from benchmarks.measuring.writing import DIRECTORY, environment_lines, figure, rounded, table, write
-from benchmarks.studies.calibration import shared
 from benchmarks.studies.calibration.cases import CASES, FLOOR, Case
+from benchmarks.studies.calibration.discrepancy import FREE as DISCREPANCY
+from benchmarks.studies.calibration.discrepancy import with_discrepancy
 from benchmarks.studies.calibration.ranks import (
     DRAWS,
     LEAST_P,
@@ -38,7 +39,7 @@ from layerjax.transport.known_directions import known_directions
 
 REPEATS, QUICK = 200, 20
 STARTS, WALKERS = 4, 12
-APART = 5.0
+LEAST_THINNING = 5.0
 """Autocorrelation times after which draws of one walker count as independent."""
 
 TEXT = """\
@@ -47,18 +48,18 @@ TEXT = """\
 {environment}
 Simulation-based calibration (Talts, Betancourt, Simpson, Vehtari & Gelman 2018, arXiv:1804.06788): {repeats} truths
 drawn from the prior, data simulated from each, and the rank of the truth among {draws} draws of the posterior that
-`fits.fit` and `fits.sample` find. If fit, noise model, priors and sampler are right, ranks are uniform.
+`fits.fit` and `fits.sample` give. If fit, noise model, priors and sampler are right, ranks are uniform.
 
-{words} {readings} readings in the plane of incidence, noise of {noise:.0%} of the exact value; the fit is
-told the level. {starts} starts a fit, {walkers} walkers. Priors:
+{words} {count} measurements in the plane of incidence, noise of {noise:.0%} of the exact value, a level
+that the fit knows. {starts} starts a fit, {walkers} walkers. Priors:
 
 {free}
 {rows}
 *chi-square* over {bins} equal bins, *KS* is the test of Kolmogorov and Smirnov; uniform: both p-values above {least:g}.
-*mean* is the mean rank less what it should be, in standard errors. *in 68 %*, *in 90 %*: truths within central
-intervals; {expected} of {repeats} are expected (central 95 % of the binomial distribution).
+*mean* is the mean rank less what it should be, in standard errors. *in 68 %*, *in 90 %*: truths that central intervals
+cover; {expected} of {repeats} are expected (central 95 % of the binomial distribution).
 
-![A histogram of ranks for each parameter, with the band that should hold 99 % of the bars]({name}.png)
+![A histogram of ranks for each parameter, with the interval that 99 % of the bars should be in]({name}.png)
 
 {chains}"""
 
@@ -67,8 +68,8 @@ intervals; {expected} of {repeats} are expected (central 95 % of the binomial di
 class Repeat:
     """One repeat, lists by parameter as in `free_of`.
 
-    truth, estimate: physical values, the estimate is that of the fit. apart: autocorrelation times between two draws of
-    one walker. fit_converged, converged: of the fit and of the chain.
+    truth, estimate: physical values, the estimate is that of the fit. thinning: of a walker, in autocorrelation times.
+    fit_converged, converged: of the fit and of the chain.
     """
 
     repeat: int
@@ -77,7 +78,7 @@ class Repeat:
     ranks: list[int]
     steps: int
     autocorrelation_time: float
-    apart: float
+    thinning: float
     fit_converged: bool
     converged: bool
     seconds: float
@@ -95,7 +96,7 @@ def study(
 ) -> tuple[str, tuple[Path, ...]]:
     """Run it, and write ``calibration.json``, ``.md`` and ``.png``; returns the markdown and the paths.
 
-    Of other posteriors than "haze" the files are ``calibration-errors.json`` and so on.
+    Of other posteriors than "haze" the files are ``calibration-discrepancy.json`` and so on.
 
     Args:
         quick: 20 repeats: a look, no result to quote.
@@ -112,7 +113,7 @@ def study(
     wanted = repeats or (QUICK if quick else REPEATS)
     settings = settings_of(case)
     path = directory / f"{case.name}.json"
-    done = _held(path, settings) if resume else []
+    done = _stored(path, settings) if resume else []
     left = sorted(set(range(wanted)) - {one.repeat for one in done})
     at_once = processes if processes > 1 else cores()
     surroundings = environment.describe()
@@ -146,7 +147,7 @@ def run_repeat(index: int, case: Case, model: Callable[..., Any]) -> Repeat:
     began = time.perf_counter()
     truth, fit = _fitted(index, case, model)
     posterior = fits.sample(fit, walkers=_walkers(case), seed=index, max_steps=case.most_steps, allow_unconverged=True)
-    draws, apart = spread_draws(posterior)
+    draws, thinning = spread_draws(posterior)
     return Repeat(
         repeat=index,
         truth=list(truth.values()),
@@ -154,7 +155,7 @@ def run_repeat(index: int, case: Case, model: Callable[..., Any]) -> Repeat:
         ranks=ranks_of(np.array(list(truth.values())), draws),
         steps=len(posterior.chain),
         autocorrelation_time=float(np.max(posterior.autocorrelation_time)),
-        apart=apart,
+        thinning=thinning,
         fit_converged=fit.converged,
         converged=posterior.converged,
         seconds=time.perf_counter() - began,
@@ -165,17 +166,17 @@ def _fitted(index: int, case: Case, model: Callable[..., Any]) -> tuple[dict[str
     """A truth from the prior, and the fit of its data."""
     generator = np.random.default_rng([2018, index])
     truth = {name: drawn(free, generator) for name, free in case.free.items()}
-    own = {name: truth[name] for name in case.own}
-    data = fits.simulate(case.stack(own), case.readings, model, case.noise, FLOOR, seed=index)
+    stack = case.stack({name: truth[name] for name in case.of_stack})
+    data = fits.simulate(stack, case.geometry, model, case.noise, FLOOR, seed=index)
     data = replace(data, values=truth.get("scale", 1.0) * data.values)
-    if case.errors:
-        data = shared.with_errors(data, truth, generator)
+    if case.discrepancy:
+        data = with_discrepancy(data, truth, generator)
     # sigma is what the model says that it is: the data's own was made with the truth, which it would give away
-    correlated = fits.Discrepancy(**shared.FREE) if case.errors else False
-    noise = fits.Noise(relative=case.noise, floor=FLOOR, use_sigma=False, discrepancy=correlated)
+    discrepancy = fits.Discrepancy(**DISCREPANCY) if case.discrepancy else False
+    noise = fits.Noise(relative=case.noise, floor=FLOOR, use_sigma=False, discrepancy=discrepancy)
     scale = case.free["scale"] if case.scale else None
     fit = fits.fit(
-        case.stack(case.own), data, transport=case.transport, noise=noise, scale=scale, starts=STARTS, seed=index
+        case.stack(case.of_stack), data, transport=case.transport, noise=noise, scale=scale, starts=STARTS, seed=index
     )
     return truth, fit
 
@@ -208,8 +209,8 @@ def drawn(free: fits.Free, generator: np.random.Generator) -> float:
 
 def settings_of(case: Case) -> dict[str, Any]:
     """What has to be the same for repeats to stand in one file, as it stands there."""
-    in_degrees = np.degrees(np.arccos(np.unique(case.readings.wi[:, 2].round(9))))
-    free = case.own if case.errors else case.free
+    in_degrees = np.degrees(np.arccos(np.unique(case.geometry.wi[:, 2].round(9))))
+    free = case.of_stack if case.discrepancy else case.free
     return rounded(
         dict(case.settings)
         | {
@@ -228,14 +229,14 @@ def settings_of(case: Case) -> dict[str, Any]:
 
 @cache
 def _simulator(posterior: str, other: lj.Transport | None) -> Callable[..., Any]:
-    """The transport as the fits use it: one program for all truths, told of the directions and of nothing else."""
+    """The transport as the fits use it: one program for all truths, which knows the directions and nothing else."""
     case = _case(posterior, other)
     transport = case.transport
-    known = known_directions(case.readings.wi, case.readings.wo) if transport.uses_known else None
+    known = known_directions(case.geometry.wi, case.geometry.wo) if transport.uses_known else None
     return jax.jit(lambda stack, wi, wo: evaluate_known(stack, wi, wo, transport, known=known))
 
 
-def _held(path: Path, settings: Mapping[str, Any]) -> list[Repeat]:
+def _stored(path: Path, settings: Mapping[str, Any]) -> list[Repeat]:
     """The repeats that a file holds; ValueError if they were run with other settings."""
     if not path.exists():
         return []
@@ -260,7 +261,7 @@ def _save(
             for one, value in case.free.items()
         ),
         name=case.name,
-        readings=len(case.readings),
+        count=len(case.geometry),
         noise=case.noise,
         starts=STARTS,
         walkers=_walkers(case),
@@ -292,7 +293,7 @@ def _table(rows: list[Row]) -> str:
             figure(row.p_chi_square, 2),
             figure(row.p_kolmogorov_smirnov, 2),
             f"{row.mean_off:+.2f}",
-            *map(str, row.within),
+            *map(str, row.covered),
             "uniform" if row.uniform else "**not uniform**",
         )
         for row in rows
@@ -304,12 +305,12 @@ def _chains(done: list[Repeat]) -> str:
     """What to know of the chains: all of them count, also those that fell short."""
     short = [str(one.repeat) for one in done if not one.converged]
     lost = [str(one.repeat) for one in done if not one.fit_converged]
-    close = [str(one.repeat) for one in done if one.apart < APART]
+    close = [str(one.repeat) for one in done if one.thinning < LEAST_THINNING]
     lines = [
         f"Chains that did not converge (ranked all the same): {_listed(short)}. Fits that did not: {_listed(lost)}.",
         f"Steps: {np.median([one.steps for one in done]):.0f} in the median, {max(one.steps for one in done)} at most. "
-        f"Draws of one walker lie {min(one.apart for one in done):.1f} autocorrelation times apart or more; less than "
-        f"{APART:g}: {_listed(close)}.",
+        f"Draws of one walker lie {min(one.thinning for one in done):.1f} autocorrelation times apart or more; less "
+        f"than {LEAST_THINNING:g}: {_listed(close)}.",
         f"Seconds a repeat: {figure(float(np.median([one.seconds for one in done])))} in the median, the first, which "
         f"compiles, {figure(done[0].seconds)}.",
     ]

@@ -83,13 +83,13 @@ class Size:
     longest: float = 30.0
 
     def walked(self, case: Case) -> int:
-        """Pairs that a walk is asked for."""
+        """Pairs at which a walk is evaluated."""
         return self.walked_opaque if case.stack.base is not None else self.walked_transmitting
 
 
 @dataclass(frozen=True)
 class Run:
-    """What a model gave at one resolution, and what it cost. indices: the pairs of the stack that it was asked for."""
+    """What a model gave at one resolution, and what it cost. indices: the evaluated pairs of the stack."""
 
     model: str
     step: str
@@ -172,7 +172,7 @@ def run(case: Case, model: Model, size: Size, programs: Programs) -> list[Run]:
 
 
 def _prepared(case: Case, model: Model, label: str, transport: lj.Transport, size: Size, programs: Programs) -> Run:
-    """Of a stack that is prepared once."""
+    """Evaluate a stack that is prepared once."""
     directions = case.directions
     if transport.random:
         indices = turns = directions.some(size.walked(case))
@@ -188,8 +188,8 @@ def _prepared(case: Case, model: Model, label: str, transport: lj.Transport, siz
     def evaluate() -> jax.Array:
         return jax.block_until_ready(lj.evaluate(prepared, wi, wo, key=key))
 
-    prepared, preparing, prepare_seconds = timing.first_and_again(prepare, size.rounds)
-    values, evaluating, seconds = timing.first_and_again(evaluate, size.rounds)
+    prepared, preparing, prepare_seconds = timing.cold_and_warm(prepare, size.rounds)
+    values, evaluating, seconds = timing.cold_and_warm(evaluate, size.rounds)
     compiling = max(preparing - prepare_seconds, 0.0) + max(evaluating - seconds, 0.0)
     compile_seconds, counted = programs.of(
         _structure(case.stack, label, model.name, len(turns)), compiling, lambda: _operations(prepared, wi, wo, key)
@@ -209,15 +209,15 @@ def _prepared(case: Case, model: Model, label: str, transport: lj.Transport, siz
 
 
 def _called(case: Case, model: Model, label: str, transport: lj.Transport, size: Size, programs: Programs) -> Run:
-    """Of a stack that is evaluated as it is: once it costs what a call for its own pairs does."""
+    """Evaluate a stack that is not prepared: its cost once is that of a call for its own pairs."""
     directions = case.directions
     indices, turns = _in_turn(directions, size)
 
     def call(wi: NDArray[np.float64], wo: NDArray[np.float64]) -> jax.Array:
         return jax.block_until_ready(lj.evaluate(case.stack, wi, wo, transport))
 
-    values, calling, few = timing.first_and_again(lambda: call(directions.wi, directions.wo), size.rounds)
-    _, _, many = timing.first_and_again(lambda: call(directions.wi[turns], directions.wo[turns]), size.rounds)
+    values, calling, few = timing.cold_and_warm(lambda: call(directions.wi, directions.wo), size.rounds)
+    _, _, many = timing.cold_and_warm(lambda: call(directions.wi[turns], directions.wo[turns]), size.rounds)
     arrays, others = eqx.partition(case.stack, eqx.is_array_like)
     compile_seconds, counted = programs.of(
         _structure(case.stack, label, model.name, len(indices)),
@@ -253,7 +253,7 @@ def _in_turn(directions: Directions, size: Size) -> tuple[NDArray[np.intp], NDAr
 
 
 def row(case: Case, run: Run, truth: Truth, limit: float) -> Row:
-    """The errors of a run beside its times. limit: relative L2 that the truth can tell."""
+    """The errors of a run beside its times. limit: relative L2 error of the truth."""
     directions, values = case.directions.take(run.indices), truth.values[run.indices]
     error = run.values - values
     l2 = _finite(relative_l2(error, values, directions.weights))

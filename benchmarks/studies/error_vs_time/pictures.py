@@ -58,7 +58,7 @@ def picture(models: Sequence[Model], judged: Sequence[Judged], rows: Sequence[Ro
 
 
 def _curve(panel: Axes, index: int, model: Model, rows: Sequence[Row], limits: Mapping[str, float]) -> None:
-    colour, marker = _look(index)
+    colour, marker = _style(index)
     points = []
     for step in model.steps:
         here = [row for row in rows if row.step == step]
@@ -79,7 +79,7 @@ def _curve(panel: Axes, index: int, model: Model, rows: Sequence[Row], limits: M
         panel.plot(x[chosen], y[chosen], marker, color=colour, markerfacecolor=face, markersize=6)
 
 
-def _look(index: int) -> tuple[str, str]:
+def _style(index: int) -> tuple[str, str]:
     """Colour and marker of a model."""
     return CYCLE[index % len(CYCLE)], MARKERS[index % len(MARKERS)]
 
@@ -89,7 +89,7 @@ def _legend(panel: Axes, models: Sequence[Model]) -> None:
     for index, model in enumerate(models):
         labels = list(model.steps)
         span = labels[0] if len(labels) == 1 else f"{labels[0]} to {labels[-1]}"
-        colour, marker = _look(index)
+        colour, marker = _style(index)
         handles.append(Line2D([], [], color=colour, marker=marker, label=f"{model.name}\n({span})"))
     for size, face, label in ((6.0, "white", "the truth is the limit"), (2.0, INK, "one stack")):
         handles.append(Line2D([], [], color=INK, marker="o", markerfacecolor=face, markersize=size, label=label))

@@ -64,16 +64,16 @@ class Setup:
 
 @dataclass(frozen=True)
 class Held:
-    """What is measured so far. judged, truths: by stack; rows: of every model; untold: stacks without a truth.
+    """What is measured so far. judged, truths: by stack; rows: of every model; without_truth: stacks that have none.
 
-    kept: truths of another run, by stack, for the models to be measured against anew.
+    reused: truths of another run, by stack, for the models to be measured against anew.
     """
 
     judged: dict[str, Judged] = field(default_factory=dict)
     truths: dict[str, Truth] = field(default_factory=dict)
     rows: list[Row] = field(default_factory=list)
-    untold: list[str] = field(default_factory=list)
-    kept: dict[str, tuple[Judged, Truth]] = field(default_factory=dict)
+    without_truth: list[str] = field(default_factory=list)
+    reused: dict[str, tuple[Judged, Truth]] = field(default_factory=dict)
 
 
 def study(
@@ -96,7 +96,7 @@ def study(
         families: keys of `suite.FAMILIES`; all if None.
         stacks: names; all of the families if None.
         resume: keep what the directory holds, measured with the same settings, and measure what it lacks: stacks, or a
-            new model. Every stack is written as soon as it is measured: an interrupted run goes on from there.
+            new model. Every stack is written as soon as it is measured, so that an interrupted run can be resumed.
         truths: a directory of results whose truths stand for stacks that are not measured yet; the models, and the
             walk that the default solver is compared with, are run anew.
         models: what is compared.
@@ -112,7 +112,7 @@ def study(
     held = _held(directory, setup.settings) if resume else Held()
     if truths is not None:
         other = _held(truths, setup.settings, apart_from=TIMED)
-        held.kept.update({name: (judged, other.truths[name]) for name, judged in other.judged.items()})
+        held.reused.update({name: (judged, other.truths[name]) for name, judged in other.judged.items()})
     programs = Programs()
     for index, case in enumerate(cases, start=1):
         keep_within()
@@ -133,21 +133,21 @@ def study(
 
 def _measure(case: Case, setup: Setup, held: Held, programs: Programs) -> bool:
     """Add to `held` what it lacks of a stack; False if that is nothing."""
-    if case.name in held.untold:
+    if case.name in held.without_truth:
         return False
     if not all(supports(transport, case.stack) for transport in vars(setup.references).values()):
-        held.untold.append(case.name)
+        held.without_truth.append(case.name)
         return False
     done = {row.model for row in held.rows if row.stack == case.name}
     # the models first: what the references compile would no longer count among their compile times
     lacking = [model for model in setup.models if model.name not in done]
     runs = [found for model in lacking for found in run(case, model, setup.size, programs)]
     if case.name not in held.judged:
-        longest, kept = setup.size.longest, held.kept.get(case.name)
+        longest, reused = setup.size.longest, held.reused.get(case.name)
         held.judged[case.name], held.truths[case.name] = (
             judge(case, setup.references, setup.size.walked(case), longest)
-            if kept is None
-            else agree_anew(case, setup.references, *kept, longest)
+            if reused is None
+            else agree_anew(case, setup.references, *reused, longest)
         )
     elif not runs:
         return False
@@ -160,14 +160,14 @@ def _save(setup: Setup, held: Held) -> tuple[str, tuple[Path, ...]]:
     """Write all that is measured so far, but no picture; returns markdown and paths."""
     judged = list(held.judged.values())
     text = error_tables.markdown(
-        setup.surroundings, setup.models, judged, held.rows, setup.size, setup.references, held.untold
+        setup.surroundings, setup.models, judged, held.rows, setup.size, setup.references, held.without_truth
     )
     content = {
         "environment": setup.surroundings,
         "quick": setup.quick,
         "settings": setup.settings,
         "stacks": [asdict(judgement) | {"limit": judgement.limit} for judgement in judged],
-        "without a truth": held.untold,
+        "without a truth": held.without_truth,
         "rows": [asdict(row) for row in held.rows],
     }
     truths = setup.directory / f"{NAME}-truth.npz"

@@ -12,28 +12,28 @@ from benchmarks.studies.error_vs_time.models import VALUES, Model, Row, Size
 from benchmarks.studies.error_vs_time.truth import STANDARD_ERRORS, TOLERANCE, Judged, References
 from benchmarks.suite.cases import FAMILIES
 
-TOLD = 0.1
-"""By what share of a call for few values a call for many has to be dearer for the difference to be told."""
+LEAST_DIFFERENCE = 0.1
+"""Least difference of a call for many values and one for few, as a share of the latter, that timings resolve."""
 
 TEXT = """\
 # Error against run time
 
 {environment}
 {stacks} stacks ({files}); what the pairs of directions are: `benchmarks/suite/cases.py`.
-{untold}
+{omitted}
 ![Error against time per value, a panel a family](error-vs-time.png)
 
 {words}
 
 A value is a pair of directions with all its channels. *ns a value* is the median of up to {rounds} repeats, everything
 compiled and prepared ({batch:,} pairs at a time; walks {opaque} over a base, {transmitting} if light passes);
-*prepare* is what a stack costs once, and *all, ns* is both when {values:,} values of a stack are asked for. *compile*
+*prepare* is what a stack costs once, and *all, ns* is both when {values:,} values of a stack are evaluated. *compile*
 is the first call less a later one, of both, of stacks whose programs no cache on disk held; stacks that differ in
 numbers alone share it. *operations* counts those of
-the lowered program of an evaluation. Steps that would take longer than {longest:g} s on a stack are left out.
+the lowered program of an evaluation. Steps that would take longer than {longest:g} s on a stack are omitted.
 Models that are given the stack itself ({called}) are
 timed for few values and for {values:,}: *ns a value* is from the difference, and a dash where that is less than
-{told:.0f} % of what few cost at half of the stacks: timings scatter by as much.
+{least:.0f} % of what few cost at half of the stacks: timings scatter by as much.
 
 The truth is {truth}, solved {dates}. Its uncertainty is its distance from its next coarser resolution,
 and {check} must not find it further off than noise explains: the larger of the two is its limit.
@@ -64,7 +64,7 @@ def markdown(
     rows: Sequence[Row],
     size: Size,
     references: References,
-    untold: Sequence[str],
+    without_truth: Sequence[str],
 ) -> str:
     """The whole results file."""
     failing = [judgement for judgement in judged if not judgement.agrees]
@@ -72,7 +72,7 @@ def markdown(
         environment=environment_lines(environment),
         stacks=len(judged),
         files="`benchmarks/suite/FAMILY/NAME.toml`",
-        untold=f"Left out, for want of a truth: {', '.join(untold)}.\n" if untold else "",
+        omitted=f"Omitted, as they have no truth: {', '.join(without_truth)}.\n" if without_truth else "",
         words=accuracy.WORDS,
         rounds=size.rounds,
         batch=size.batch,
@@ -81,7 +81,7 @@ def markdown(
         values=VALUES,
         longest=size.longest,
         called=_listed(model.name for model in models if model.called),
-        told=100 * TOLD,
+        least=100 * LEAST_DIFFERENCE,
         truth=_name(references.truth),
         dates=_dates(judged),
         check=_name(references.check),
@@ -113,12 +113,12 @@ def steps(models: Sequence[Model]) -> list[tuple[str, str]]:
 
 
 def limits_of(judged: Sequence[Judged]) -> dict[str, float]:
-    """Relative L2 error that the truth of each stack can tell."""
+    """Relative L2 error of the truth of each stack."""
     return {judgement.stack: judgement.limit for judgement in judged}
 
 
 def floored(row: Row, limits: Mapping[str, float]) -> float:
-    """Relative L2 error, not below what the truth can tell; NaN where the model's values were not finite."""
+    """Relative L2 error, not below that of the truth; NaN where the model's values were not finite."""
     return float("nan") if row.l2 is None else max(row.l2, limits[row.stack])
 
 
@@ -132,10 +132,10 @@ def limited_percent(row: Row, limits: Mapping[str, float]) -> str:
     return ("<= " if row.truth_limits else "") + percent(floored(row, limits))
 
 
-def time_of_a_value(found: Sequence[Row], called: bool) -> str:
-    """The median of nanoseconds a value; a dash for differences that half of the stacks do not tell."""
-    told = sum(row.nanoseconds_per_value >= TOLD * once(row) for row in found)
-    return figure(_median(row.nanoseconds_per_value for row in found)) if not called or 2 * told > len(found) else "-"
+def time_of_a_value(rows: Sequence[Row], called: bool) -> str:
+    """The median of nanoseconds a value; a dash for differences that timings do not resolve at half of the stacks."""
+    resolved = sum(row.nanoseconds_per_value >= LEAST_DIFFERENCE * once(row) for row in rows)
+    return figure(_median(row.nanoseconds_per_value for row in rows)) if not called or 2 * resolved > len(rows) else "-"
 
 
 def _summary(models: Sequence[Model], judged: Sequence[Judged], rows: Sequence[Row]) -> str:
@@ -254,7 +254,7 @@ def _median(values: Iterable[float]) -> float:
 
 
 def _largest(errors: Iterable[tuple[float | None, float]]) -> str:
-    """The largest of errors given with what the truth can tell of each, in percent."""
+    """The largest of errors, each with that of its truth, in percent."""
     finite = [(max(error, limit), error <= limit) for error, limit in errors if error is not None]
     if not finite:
         return "-"

@@ -28,7 +28,7 @@ ROUNDED = 1e-14
 """1/sr: what sums of 64 modes of light of order 1 are rounded to in float64, and no path of a walk ever brings."""
 
 ROUNDING = 1e-9
-"""Relative error of sums in float64 that nothing is told apart below, also where a truth is exact."""
+"""Relative error of sums in float64: the least limit of a truth, also where it is exact."""
 
 
 @dataclass(frozen=True)

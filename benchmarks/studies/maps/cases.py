@@ -26,7 +26,7 @@ FREE: Literal[4] = 4
 
 @dataclass(frozen=True)
 class Case:
-    """A material with the transport that it is read and fitted by.
+    """A material with the transport that it is simulated and fitted by.
 
     bar: of fits a second, in scipy's. rate: of fits a second by two processes.
     """
@@ -46,7 +46,7 @@ CASES = (
 
 
 @dataclass(frozen=True)
-class Given:
+class StoredMap:
     """A map whose measurements are in a file, and where its store is to be. truth: of each parameter, (H, W)."""
 
     stack: lj.Stack
@@ -59,7 +59,7 @@ class Given:
 
 
 @contextmanager
-def given(case: Case, side: int) -> Iterator[Given]:
+def painted_map(case: Case, side: int) -> Iterator[StoredMap]:
     """A painted map of side x side texels; its files go with the block."""
     picture = painted((side, side), case.transport, material=case.material, free=FREE)
     with stored(picture.stack, picture.geometry, picture.noise, case.transport, picture.values, picture.truth) as one:
@@ -74,15 +74,15 @@ def stored(
     transport: Any,
     values: Floats,
     truth: Mapping[str, Floats],
-) -> Iterator[Given]:
+) -> Iterator[StoredMap]:
     """A map with its measurements (H, W, N, C) in a file that goes with the block."""
     with tempfile.TemporaryDirectory(prefix="layerjax-maps-") as folder:
         path = Path(folder) / "values.npy"
         np.save(path, values)
-        yield Given(stack, geometry, noise, transport, truth, path, Path(folder) / "map.zarr")
+        yield StoredMap(stack, geometry, noise, transport, truth, path, Path(folder) / "map.zarr")
 
 
-def job_of(one: Given, chunk: int) -> tuple[Job, list[Block]]:
+def job_of(one: StoredMap, chunk: int) -> tuple[Job, list[Block]]:
     """The work of a map that has been fitted, as its workers had it, and the tasks of all chunks."""
     data, store, options = map_data(one.values, one.geometry), Store(one.store), MapOptions(chunk_size=chunk)
     texels, kept = pilot_texels(data, options.pilot_texels), store.load_group(PILOT)

@@ -16,10 +16,10 @@ import fits
 import layerjax as lj
 from benchmarks.measuring.timing import once
 from benchmarks.measuring.writing import Bar, figure, table
-from benchmarks.studies.maps.cases import Case, Given, given, job_of, stored
+from benchmarks.studies.maps.cases import Case, StoredMap, job_of, painted_map, stored
 from benchmarks.studies.maps.fitting import PROCESSES, Report, Row, Size, finished, fitted
 from benchmarks.studies.maps.work import Meeting, Timed, redo, timed, warm_up
-from benchmarks.suite.maps import readings
+from benchmarks.suite.maps import goniometer_slices
 from fits.engines import run as run_tasks
 from fits.engines.processes import run_processes
 from fits.engines.worker import configure
@@ -49,7 +49,7 @@ class Figure:
 
 def run(case: Case, rows: Sequence[Row], size: Size, report: Report) -> list[Figure]:
     """Figures of the engines with the chunks of one map, of overhead, and of the memory that all maps took."""
-    with given(case, size.side) as one:
+    with painted_map(case, size.side) as one:
         fitted(one, size)
         figures = by_workers(one, size, report)
     report("overhead of a chunk")
@@ -69,7 +69,7 @@ def run(case: Case, rows: Sequence[Row], size: Size, report: Report) -> list[Fig
     return figures
 
 
-def by_workers(one: Given, size: Size, report: Report) -> list[Figure]:
+def by_workers(one: StoredMap, size: Size, report: Report) -> list[Figure]:
     """Rates of one worker process, of two, and of a cluster of two, in turns."""
     job, tasks = job_of(one, size.chunk)
     rates: dict[str, list[float]] = {"one": [], "two": [], "dask": []}
@@ -84,8 +84,8 @@ def by_workers(one: Given, size: Size, report: Report) -> list[Figure]:
                 client.run(configure, bool(jax.config.values["jax_enable_x64"]), threads=1)  # before it unpacks arrays
                 client.run(warm_up, job, tasks[0])
                 rates["dask"].append(steady(run_tasks(timed, job, tasks * PROCESSES * size.repeats, client=client)))
-        told = ", ".join(f"{name} {values[-1]:.0f}" for name, values in rates.items() if values)
-        report(f"workers, round {index + 1}: fits/s of {told}")
+        rates_now = ", ".join(f"{name} {values[-1]:.0f}" for name, values in rates.items() if values)
+        report(f"workers, round {index + 1}: fits/s of {rates_now}")
     note = f"{figure(float(np.median(rates['one'])))} fits/s of one spawned process with one thread"
     figures = [_ratio("2 processes against 1", rates["two"], rates["one"], PAIR, note)]
     if missing is None:
@@ -153,7 +153,7 @@ def overhead(size: Size) -> list[Figure]:
     """Milliseconds of a chunk of 1,024 texels beside its solution, with a model that costs nothing."""
     numbers = [fits.Free(0.5, 0.0, 2.0), fits.Free(0.5, 0.0, 1.0), fits.Free(0.5, 0.01, 1.0), fits.Free(0.5, 0.0, 1.0)]
     stack = lj.Stack([lj.Medium(numbers[0], numbers[1], lj.SGGX("surface", numbers[2]))], lj.Lambertian(numbers[3]))
-    geometry, side, noise = readings(), int(size.chunk**0.5), fits.Noise(relative=0.02)
+    geometry, side, noise = goniometer_slices(), int(size.chunk**0.5), fits.Noise(relative=0.02)
     ci, co = geometry.wi[:, 2], geometry.wo[:, 2]
     exact = 0.5 * (1.0 + ci + co + ci * co)
     values = exact * (1.0 + 0.02 * np.random.default_rng(1).standard_normal((side, side, len(exact))))
@@ -186,10 +186,10 @@ def _solving() -> Iterator[list[float]]:
 
     call = texels._call
 
-    def measured(*given: Any, **options: Any) -> Any:
-        found: list[Any] = []
-        spent.append(once(lambda: found.append(call(*given, **options))))
-        return found[0]
+    def measured(*arguments: Any, **options: Any) -> Any:
+        results: list[Any] = []
+        spent.append(once(lambda: results.append(call(*arguments, **options))))
+        return results[0]
 
     with patch.object(texels, "_call", measured):
         yield spent

@@ -1,4 +1,4 @@
-"""Fits a second beside scipy, how good they are, and what the sample takes that is fitted first."""
+"""Fits a second beside scipy, how good they are, and what the pilot takes."""
 
 import tempfile
 import time
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 import fits
 import layerjax as lj
 from benchmarks.measuring.writing import figure, table
-from benchmarks.studies.maps.cases import Case, Given, given, job_of
+from benchmarks.studies.maps.cases import Case, StoredMap, job_of, painted_map
 from benchmarks.studies.maps.work import Texelwise, Timed, costs_at, rows_of, timed
 from fits.engines import Failure
 from fits.engines import run as run_tasks
@@ -27,10 +27,10 @@ Report = Callable[[str], None]
 
 PROCESSES = 2
 OTHER = 0.01
-"""By so much a cost is below scipy's where that has ended elsewhere."""
+"""Difference of costs from which on ours is below scipy's because scipy is at another local minimum."""
 
 ROUNDING = 1e-6
-"""By so much a cost may be above scipy's: a fit stops where a full step promises less than a hundredth of it."""
+"""Most that a cost may be above scipy's: a fit stops where a full step is predicted to gain a hundredth of it."""
 
 
 @dataclass(frozen=True)
@@ -92,17 +92,17 @@ def run(cases: Sequence[Case], size: Size, with_peers: bool, report: Report) -> 
     rows = []
     for case in cases:
         report(f"{case.name}: painted")
-        with given(case, size.side) as one:
+        with painted_map(case, size.side) as one:
             rows.append(measure(case, one, size, with_peers, report))
     return rows
 
 
-def measure(case: Case, one: Given, size: Size, with_peers: bool, report: Report) -> Row:
+def measure(case: Case, one: StoredMap, size: Size, with_peers: bool, report: Report) -> Row:
     """One map: fitted twice, the first time of one chunk, which compiles; then chunks by turns with scipy."""
     side = min(size.side, int(size.chunk**0.5))
     first, _, _ = fitted(one, size, np.load(one.values, mmap_mode="r")[:side, :side])
-    pilot, whole, found = fitted(one, size)
-    report(f"{case.name}: {found.values[found.names[0]].size:,} texels, pilot {pilot:.0f} s, all others {whole:.0f} s")
+    pilot, whole, fit = fitted(one, size)
+    report(f"{case.name}: {fit.values[fit.names[0]].size:,} texels, pilot {pilot:.0f} s, all others {whole:.0f} s")
     job, tasks = job_of(one, size.chunk)
     turns = by_turns(tasks, size if with_peers else replace(size, scipy=(0, size.scipy[1])))
     done = [*finished(run_tasks(timed, job, turns, processes=PROCESSES))]
@@ -110,10 +110,10 @@ def measure(case: Case, one: Given, size: Size, with_peers: bool, report: Report
     scipy = rate([task for _, task in warm(done) if task.kind == "scipy"]) if with_peers else None
     report(f"{case.name}: {ours:.0f} fits/s, scipy {figure(scipy)}")
     ratio = None if scipy is None else ours / scipy
-    differences = _differences(job, found, turns, done)
+    differences = _differences(job, fit, turns, done)
     return Row(
         name=case.name,
-        texels=found.flags.size,
+        texels=fit.flags.size,
         rate=ours,
         scipy=scipy,
         ratio=ratio,
@@ -122,15 +122,15 @@ def measure(case: Case, one: Given, size: Size, with_peers: bool, report: Report
         first=first,
         pilot=pilot,
         whole=whole,
-        converged=float(np.mean(found.has("converged"))),
-        poor=float(np.mean(found.has("poor"))),
+        converged=float(np.mean(fit.has("converged"))),
+        poor=float(np.mean(fit.has("poor"))),
         compared=len(differences),
         above=float(np.mean(differences > ROUNDING)) if len(differences) else None,
         below=float(np.mean(differences < -OTHER)) if len(differences) else None,
-        width=pull_width(found, one),
-        chi_square=float(np.nanmean(found.reduced_chi_square)),
-        emulator=emulator_error(job, found, size.checked),
-        words=str(found.attributes["numerical"].get("emulator", "")),
+        width=width_of_pulls(fit, one),
+        chi_square=float(np.nanmean(fit.reduced_chi_square)),
+        emulator=emulator_error(job, fit, size.checked),
+        words=str(fit.attributes["numerical"].get("emulator", "")),
         peak=cold_peak(job, tasks),
     )
 
@@ -161,16 +161,16 @@ def _verdict(case: Case, rate: float, ratio: float | None) -> str:
 
 
 def fitted(
-    one: Given, size: Size, values: Floats | None = None, processes: int = PROCESSES
+    one: StoredMap, size: Size, values: Floats | None = None, processes: int = PROCESSES
 ) -> tuple[float, float, FittedMap]:
     """Seconds before the first chunk, seconds of the chunks, and the map. values: in the place of those in the file."""
-    began, told = time.perf_counter(), []
+    began, chunks_began = time.perf_counter(), []
 
     def progress(stage: str, done: int, total: int | None = None, info: str = "") -> None:
         if stage == "map" and done == 0:
-            told.append(time.perf_counter())
+            chunks_began.append(time.perf_counter())
 
-    found = fits.fit_map(
+    fit = fits.fit_map(
         one.stack,
         one.geometry,
         one.values if values is None else values,
@@ -179,7 +179,7 @@ def fitted(
         transport=one.transport,
         options=fits.MapOptions(chunk_size=size.chunk, processes=processes, progress=progress),
     )
-    return told[0] - began, time.perf_counter() - told[0], found
+    return chunks_began[0] - began, time.perf_counter() - chunks_began[0], fit
 
 
 def by_turns(tasks: list[Block], size: Size) -> list[Block | Texelwise]:
@@ -208,14 +208,14 @@ def finished(results: Any) -> Any:
 
 def warm(done: Sequence[tuple[int, Timed]]) -> list[tuple[int, Timed]]:
     """Without the first of its kind in each process, which compiles; all of them if there is nothing else."""
-    seen: set[tuple[int, str]] = set()
-    kept = []
+    compiled: set[tuple[int, str]] = set()
+    counted = []
     for index, task in sorted(done, key=lambda entry: entry[1].began):
-        if (task.process, task.kind) in seen:
-            kept.append((index, task))
-        seen.add((task.process, task.kind))
-    lacking = {task.kind for _, task in done} - {task.kind for _, task in kept}
-    return kept + [entry for entry in done if entry[1].kind in lacking]
+        if (task.process, task.kind) in compiled:
+            counted.append((index, task))
+        compiled.add((task.process, task.kind))
+    others = {task.kind for _, task in done} - {task.kind for _, task in counted}
+    return counted + [entry for entry in done if entry[1].kind in others]
 
 
 def rate(tasks: Sequence[Timed]) -> float:
@@ -224,46 +224,46 @@ def rate(tasks: Sequence[Timed]) -> float:
 
 
 def _differences(
-    job: Job, found: FittedMap, turns: Sequence[Block | Texelwise], done: Sequence[tuple[int, Timed]]
+    job: Job, fit: FittedMap, turns: Sequence[Block | Texelwise], done: Sequence[tuple[int, Timed]]
 ) -> Floats:
     """Our costs less scipy's, of the texels that it fitted."""
     parts = []
-    for index, told in done:
+    for index, result in done:
         task = turns[index]
         if isinstance(task, Texelwise):
-            rows, vectors = rows_of(job, task), vectors_of(found, task)
-            parts.append(costs_at(job, rows, vectors) - np.array(told.costs))
+            rows, vectors = rows_of(job, task), vectors_of(fit, task)
+            parts.append(costs_at(job, rows, vectors) - np.array(result.costs))
     return np.concatenate([np.empty(0), *parts])
 
 
-def vectors_of(found: FittedMap, task: Texelwise) -> Floats:
+def vectors_of(fit: FittedMap, task: Texelwise) -> Floats:
     """The fitted numbers of those texels, (M, P)."""
     places, block = list(task.places), task.task
-    return np.stack([np.asarray(found[f"values/{name}"][block]).ravel()[places] for name in found.names], axis=1)
+    return np.stack([np.asarray(fit[f"values/{name}"][block]).ravel()[places] for name in fit.names], axis=1)
 
 
-def pull_width(found: FittedMap, one: Given) -> float:
+def width_of_pulls(fit: FittedMap, one: StoredMap) -> float:
     """Half of what the middle 68 % of the pulls span, of the parameter that is furthest from 1.
 
-    Of texels whose data say something of every parameter, within its bounds.
+    Texels with an unidentified parameter or one at a bound do not count.
     """
-    good = found.has("converged") & ~found.has("at_bound") & ~found.has("unidentified")
+    good = fit.has("converged") & ~fit.has("at_bound") & ~fit.has("unidentified")
     widths = []
     for name, truth in one.truth.items():
-        pulls = ((found.values[name] - truth) / found.errors[name])[good]
+        pulls = ((fit.values[name] - truth) / fit.errors[name])[good]
         low, high = np.quantile(pulls, [0.158655, 0.841345])
         widths.append(0.5 * (high - low))
     return float(max(widths, key=lambda width: abs(width - 1.0)))
 
 
-def emulator_error(job: Job, found: FittedMap, checked: int) -> float | None:
-    """Of the model at the optimum, beside the transport at the next finer resolution, in standard deviations."""
+def emulator_error(job: Job, fit: FittedMap, checked: int) -> float | None:
+    """Largest error of the model at the optimum, from the next finer resolution, in standard deviations."""
     problem = job.pilot.problem
     transport = problem.transport
     if not isinstance(transport, lj.AddingDoubling):
         return None
-    at = np.linspace(0, found.flags.size - 1, checked).astype(int)
-    vectors = np.stack([found.values[name].ravel()[at] for name in found.names], axis=1)
+    at = np.linspace(0, fit.flags.size - 1, checked).astype(int)
+    vectors = np.stack([fit.values[name].ravel()[at] for name in fit.names], axis=1)
     mine = predict_all(problem, vectors)
     fine = predict_all(replace(problem, transport=transport.finer()), vectors)
     sigma = sigmas(problem, vectors, fine)

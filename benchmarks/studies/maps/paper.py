@@ -32,7 +32,7 @@ class Paper:
     """What a map of `TEXELS` costs on a cluster, by the rates of a row.
 
     seconds: of a chunk on a core. saturated: cores from which on the scheduler is too slow for them. times: seconds of
-    the map on so many of `CORES`, the sample, which one machine fits, among them.
+    the map on so many of `CORES`, the pilot, which one machine fits, among them.
     """
 
     name: str
@@ -68,7 +68,7 @@ def on_paper(row: Row, chunk: int, handed: float | None, texels: int = TEXELS) -
 
 
 def _engine(name: str, results: Iterable[tuple[int, Any]]) -> Engine:
-    """From the end of the first task, by when there is a worker, to that of the last."""
+    """Rate of an engine from the end of the first task, when it has workers, to that of the last."""
     ended = sorted(task.ended for task in (task for _, task in finished(results)))
     seconds, count = max(ended[-1] - ended[0], 1e-9), len(ended) - 1
     return Engine(name, len(ended), count / seconds, 1e3 * seconds / count)

@@ -39,7 +39,7 @@ class Timed(NamedTuple):
     """A task that has been done.
 
     kind: "ours", "scipy" or "empty". fits: how many. began, ended: in seconds of the machine's clock. peak: bytes that
-    the process has had in memory. costs: of scipy's ends.
+    the process has had in memory. costs: of scipy's fits.
     """
 
     kind: str
@@ -120,7 +120,7 @@ def first_starts(job: Job, rows: Texels) -> Floats:
 
 
 def scipy_fit(job: Job, row: Texels, unit: Floats) -> float:
-    """The cost of scipy's end, with compiled residuals and Jacobian, in the unit box, which suits it best."""
+    """The cost of scipy's minimum, with compiled residuals and Jacobian, in the unit box, which suits it best."""
     arrays, (residuals, jacobian) = jax.tree.map(jnp.asarray, row), _compiled(job.pilot.problem)
     return float(
         least_squares(

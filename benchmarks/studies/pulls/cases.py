@@ -1,4 +1,4 @@
-"""What is recovered: readings by an instrument, of a surface that is partly bare, and of bins of a table."""
+"""What is recovered: measurements by an instrument, of a surface that is partly bare, and from bins of a table."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -23,7 +23,8 @@ Floats = NDArray[np.float64]
 NOISE = 0.02
 FLOOR = 1e-6
 DETECTORS = (0.5, 1.0, 2.0, 4.0)
-LEANS = 0.3
+TILT = 0.3
+"""Degrees by which the sample is tilted."""
 GAIN = 0.03
 BINS = 2000
 STRATA: tuple[Strata, ...] = ("bins", "flux")
@@ -41,9 +42,9 @@ class Case:
 
 
 def by_instruments(repeats: int) -> Iterator[Case]:
-    """A glossy coat seen by detectors of several widths, leaning a little, with gains: with the instrument, without."""
+    """A glossy coat by detectors of several widths, with tilt and gains, fitted with the instrument or without."""
     geometry = fits.slices(incidence=(10.0, 30.0, 50.0, 70.0), outgoing=np.arange(-80.0, 81.0, 2.0))
-    upright = Rotation.from_euler("y", -LEANS, degrees=True)
+    upright = Rotation.from_euler("y", -TILT, degrees=True)
     wi, wo = upright.apply(geometry.wi), upright.apply(geometry.wo)
     truth = {"layers[0].ior": 1.5, "layers[0].alpha": 0.08, "base.albedo": 0.3}
     coat = lj.Stack([lj.Interface(1.5, 0.08)], lj.Lambertian(0.3))
@@ -61,7 +62,7 @@ def by_instruments(repeats: int) -> Iterator[Case]:
         values = gains * exact * (1.0 + NOISE * generator.standard_normal((repeats, *exact.shape)))
         instrument = fits.Instrument(detector_aperture=detector, tilt=fits.Free(0.0, -2.0, 2.0), gain_sd=GAIN)
         name = f"detector of {detector:g} degrees"
-        known = truth | {"instrument.tilt": LEANS}
+        known = truth | {"instrument.tilt": TILT}
         yield Case(name, "with the instrument", _problem(free, data, instrument=instrument), values, known)
         yield Case(name, "without", _problem(free, data), values, truth)
 
@@ -84,7 +85,7 @@ def of_mixtures(repeats: int) -> Iterator[Case]:
 
 
 def of_bins(repeats: int, folder: Path) -> Iterator[Case]:
-    """Six materials as MERL tables, of which some bins are read."""
+    """Six materials as MERL tables, of which some bins are fitted."""
     for name, (stack, free) in materials().items():
         path = folder / f"{name.replace(' ', '_')}.binary"
         write_table(path, stack)
@@ -148,7 +149,7 @@ def write_table(path: Path, stack: lj.Stack, noise: float = 0.0) -> None:
 
 
 def carrier(stack: lj.Stack | lj.Mixture) -> lj.Transport:
-    """A cheap transport that carries it, for what is asked here is not what a transport leaves out."""
+    """A cheap transport that supports it; what it neglects does not matter, as it also makes the data."""
     media = isinstance(stack, lj.Stack) and any(isinstance(layer, lj.Medium) for layer in stack.layers)
     return lj.SingleScattering() if media else lj.Statistical()
 

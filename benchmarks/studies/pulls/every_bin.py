@@ -1,4 +1,4 @@
-"""A fit to every bin of a MERL table, in a process of its own whose memory tells what it takes."""
+"""A fit to every bin of a MERL table, in a process of its own whose memory is that of the fit."""
 
 import json
 import resource
@@ -24,14 +24,14 @@ def main(path: str) -> None:
     data = fits.read(Path(path), bins="all")
     _, free = materials()["flakes over paint"]
     noise = fits.Noise(relative=NOISE, floor=FLOOR, discrepancy=False)
-    found = fits.fit(free, data, transport=lj.SingleScattering(), noise=noise, starts=2)
+    fit = fits.fit(free, data, transport=lj.SingleScattering(), noise=noise, starts=2)
     unit = 1 if sys.platform == "darwin" else 1024
     content = {
-        "readings": len(data),
+        "measurements": len(data),
         "seconds": time.perf_counter() - began,
         "bytes": unit * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss,
-        "values": found.values,
-        "errors": dict(zip(found.problem.names, map(float, found.errors), strict=True)),
+        "values": fit.values,
+        "errors": dict(zip(fit.problem.names, map(float, fit.errors), strict=True)),
     }
     print(json.dumps(content))
 

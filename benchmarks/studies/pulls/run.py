@@ -25,15 +25,15 @@ TEXT = """\
 # Pulls: instruments, mixtures and tables of bins
 
 {environment}
-Simulated readings with {noise:.0%} noise, fitted from one start. *bias* and *pull*: (fitted - true) over the standard
-error, its mean and standard deviation over the repeats. *within 3*: share of the repeats within {within:g} standard
-errors; asked for: {enough:.0%}.
+Simulated measurements with {noise:.0%} noise, fitted from one start. *mean pull* and *sd of pulls*: mean and standard
+deviation over the repeats of (fitted - true) / standard error. *within 3*: share of the repeats within {within:g}
+standard errors; required: {enough:.0%}.
 
 ## Instruments ({many} repeats)
 
-A coat of alpha 0.08 over a diffuse base, at 10, 30, 50 and 70 degrees, every 2 degrees. Readings are means over the
-detector's cone by dense quadrature; the sample leans by {leans:g} degrees, and each incidence has a gain of its own,
-{gain:.0%} about 1. Fitted with `fits.Instrument(detector_aperture=..., tilt=Free, gain_sd={gain})`, and without.
+A coat of alpha 0.08 over a diffuse base, at 10, 30, 50 and 70 degrees, every 2 degrees. Measurements are means over the
+detector's aperture by dense quadrature; the sample is tilted by {tilt:g} degrees, and each incidence has a gain of its
+own, {gain:.0%} about 1. Fitted with `fits.Instrument(detector_aperture=..., tilt=Free, gain_sd={gain})`, and without.
 
 {instruments}
 ## Mixtures ({many} repeats)
@@ -41,13 +41,13 @@ detector's cone by dense quadrature; the sample leans by {leans:g} degrees, and 
 {mixtures}
 ## Bins of MERL tables ({few} repeats)
 
-Tables of six materials, read at {bins:,} bins that were chosen by each of both strata. Asked for: a mean pull within 3
+Tables of six materials, fitted to {bins:,} bins that were chosen by each of both strata. Required: a mean pull within 3
 of its standard errors of 0, and a standard deviation within 3 of its own, {unit:.2f}, of 1.
 
 {tables}
 ## Every bin
 
-{every}"""
+{all_bins}"""
 
 
 @dataclass(frozen=True)
@@ -61,22 +61,22 @@ class Row:
     truth: float
     typical: float
     error: float
-    bias: float
-    pull: float
-    within: float
+    mean_of_pulls: float
+    sd_of_pulls: float
+    within_3: float
     converged: float
     repeats: int
 
     @property
     def recovered(self) -> bool:
         """Whether enough repeats are within 3 standard errors."""
-        return self.within >= ENOUGH
+        return self.within_3 >= ENOUGH
 
     @property
     def of_unit_width(self) -> bool:
         """Whether pulls are those of unbiased values with honest errors."""
-        own = self.pull / np.sqrt(self.repeats), 1.0 / np.sqrt(2 * self.repeats)
-        return abs(self.bias) <= WITHIN * own[0] and abs(self.pull - 1.0) <= WITHIN * own[1]
+        errors = self.sd_of_pulls / np.sqrt(self.repeats), 1.0 / np.sqrt(2 * self.repeats)
+        return abs(self.mean_of_pulls) <= WITHIN * errors[0] and abs(self.sd_of_pulls - 1.0) <= WITHIN * errors[1]
 
 
 @dataclass(frozen=True)
@@ -101,15 +101,15 @@ def study(
     surroundings = environment.describe()
     rows: list[Row] = []
     with tempfile.TemporaryDirectory() as folder:
-        for group, found in (
+        for group, cases_of_group in (
             ("instruments", cases.by_instruments(size.many)),
             ("mixtures", cases.of_mixtures(size.many)),
             ("tables", cases.of_bins(size.few, Path(folder))),
         ):
-            for case in found:
+            for case in cases_of_group:
                 rows += run_case(group, case)
-                report(f"{case.name}, {case.how}: {min(row.within for row in rows if row.name == case.name):.0%}")
-        every = every_bin(Path(folder) / "noisy.binary")
+                report(f"{case.name}, {case.how}: {min(row.within_3 for row in rows if row.name == case.name):.0%}")
+        fit_of_all = all_bins(Path(folder) / "noisy.binary")
     text = TEXT.format(
         environment=environment_lines(surroundings),
         noise=cases.NOISE,
@@ -117,7 +117,7 @@ def study(
         enough=ENOUGH,
         many=size.many,
         few=size.few,
-        leans=cases.LEANS,
+        tilt=cases.TILT,
         gain=cases.GAIN,
         bins=cases.BINS,
         unit=1.0 / np.sqrt(2 * size.few),
@@ -125,19 +125,19 @@ def study(
             group: _table([row for row in rows if row.group == group], group == "tables")
             for group in ("instruments", "mixtures", "tables")
         },
-        every=_every_text(every),
+        all_bins=_all_bins_text(fit_of_all),
     )
-    content = {"environment": surroundings, "rows": [asdict(row) for row in rows], "every bin": every}
+    content = {"environment": surroundings, "rows": [asdict(row) for row in rows], "every bin": fit_of_all}
     return text, write(NAME, content, text, directory)
 
 
 def run_case(group: str, case: Case) -> list[Row]:
     """All repeats of one case, fitted at once: a row for each parameter whose truth is known."""
-    found = fit_many(case.problem, case.values)
+    repeats = fit_many(case.problem, case.values)
     rows = []
     for name, truth in case.truth.items():
         place = case.problem.names.index(name)
-        fitted, error = found.vectors[:, place], found.standard_errors[:, place]
+        fitted, error = repeats.vectors[:, place], repeats.standard_errors[:, place]
         pulls = (fitted - truth) / error
         rows.append(
             Row(
@@ -148,44 +148,45 @@ def run_case(group: str, case: Case) -> list[Row]:
                 truth=float(truth),
                 typical=float(np.median(fitted)),
                 error=float(np.median(error)),
-                bias=float(np.mean(pulls)),
-                pull=float(np.std(pulls, ddof=1)),
-                within=float(np.mean(np.abs(pulls) <= WITHIN)),
-                converged=float(np.mean(found.converged)),
+                mean_of_pulls=float(np.mean(pulls)),
+                sd_of_pulls=float(np.std(pulls, ddof=1)),
+                within_3=float(np.mean(np.abs(pulls) <= WITHIN)),
+                converged=float(np.mean(repeats.converged)),
                 repeats=len(pulls),
             )
         )
     return rows
 
 
-def every_bin(path: Path) -> dict[str, Any]:
-    """What a fit to every bin of a noisy table gives and takes."""
+def all_bins(path: Path) -> dict[str, Any]:
+    """Values, errors, time and memory of a fit to every bin of a noisy table."""
     stack, _ = cases.materials()["flakes over paint"]
     cases.write_table(path, stack, cases.NOISE)
     words = [sys.executable, "-m", "benchmarks.studies.pulls.every_bin", str(path)]
     done = subprocess.run(words, check=True, capture_output=True, text=True)
-    found: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
-    return found
+    results: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
+    return results
 
 
 def _table(rows: list[Row], of_tables: bool) -> str:
-    heads = ("", "", "parameter", "truth", "median", "error", "bias", "pull", "within 3", "converged", "as asked")
+    heads: tuple[str, ...] = ("", "", "parameter", "truth", "median", "error", "mean pull", "sd of pulls")
+    heads += ("within 3", "converged", "verdict")
     body = []
     for row in rows:
-        asked = row.of_unit_width if of_tables else row.recovered
-        words = "met" if asked else "no" if row.how == "without" else "**not met**"
-        numbers = (figure(row.truth), figure(row.typical, 4), figure(row.error, 2), f"{row.bias:+.2f}")
-        shares = (f"{row.pull:.2f}", f"{row.within:.0%}", f"{row.converged:.0%}")
+        met = row.of_unit_width if of_tables else row.recovered
+        words = "met" if met else "no" if row.how == "without" else "**not met**"
+        numbers = (figure(row.truth), figure(row.typical, 4), figure(row.error, 2), f"{row.mean_of_pulls:+.2f}")
+        shares = (f"{row.sd_of_pulls:.2f}", f"{row.within_3:.0%}", f"{row.converged:.0%}")
         body.append((row.name, row.how, row.parameter, *numbers, *shares, words))
     return table(heads, body)
 
 
-def _every_text(every: dict[str, Any]) -> str:
-    verdict = "met" if every["bytes"] < MOST_BYTES else "**not met**"
+def _all_bins_text(fit: dict[str, Any]) -> str:
+    verdict = "met" if fit["bytes"] < MOST_BYTES else "**not met**"
     heads = "parameter", "fitted", "error"
-    body = [(name, figure(value, 6), figure(every["errors"][name], 2)) for name, value in every["values"].items()]
+    body = [(name, figure(value, 6), figure(fit["errors"][name], 2)) for name, value in fit["values"].items()]
     return (
-        f"Flakes over paint, {every['readings']:,} bins in three channels: {every['seconds']:.0f} s with two starts, "
-        f"{every['bytes'] / 1e9:.1f} GB at most (asked for: under {MOST_BYTES / 1e9:g} GB, {verdict}).\n\n"
+        f"Flakes over paint, {fit['measurements']:,} bins in three channels: {fit['seconds']:.0f} s with two starts, "
+        f"{fit['bytes'] / 1e9:.1f} GB at most (required: under {MOST_BYTES / 1e9:g} GB, {verdict}).\n\n"
         + table(heads, body)
     )

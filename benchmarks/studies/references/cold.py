@@ -48,13 +48,13 @@ def fresh(what: What, work: Work) -> dict[str, float]:
     program = f"import sys; from {__name__} import main; main(sys.argv[1:])"
     command = [sys.executable, "-c", program, what, json.dumps(asdict(work)), str(time.time())]
     ended = subprocess.run(command, cwd=ROOT, env=environment, stdout=subprocess.PIPE, text=True, check=True)
-    found: dict[str, float] = json.loads(ended.stdout)
-    return found
+    results: dict[str, float] = json.loads(ended.stdout)
+    return results
 
 
 def programs(transport: lj.Transport) -> dict[str, Program]:
-    """Compiled functions of the six parameters: all readings; these and their Jacobian; a loss and its gradient."""
-    geometry = coated_haze.readings()
+    """Compiled functions of the six parameters: all values; these and their Jacobian; a loss and its gradient."""
+    geometry = coated_haze.goniometer_slices()
 
     def value(p: Array) -> Array:
         stack = coated_haze.stack_of(dict(zip(coated_haze.PARAMETERS, p, strict=True)))
@@ -98,7 +98,7 @@ def fitting(work: Work, began: float) -> dict[str, float]:
 
     def fit(seed: int) -> fits.Fit:
         data = fits.simulate(
-            coated_haze.stack_of(), coated_haze.readings(), transport=work.transport, noise=NOISE, seed=seed
+            coated_haze.stack_of(), coated_haze.goniometer_slices(), transport=work.transport, noise=NOISE, seed=seed
         )
         return fits.fit(stack, data, transport=work.transport, noise=noise, starts=work.starts, seed=seed)
 

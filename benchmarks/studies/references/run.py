@@ -48,7 +48,7 @@ FULL_RESOLUTIONS = (
 )
 """Nodes and modes of `AddingDoubling` that are tried for the full BRDF."""
 FINEST, FINE = (64, 96), (32, 64)
-"""What counts as exact: for the full BRDF, and where 1 % is asked for."""
+"""What counts as exact: for the full BRDF, and where 1 % is required."""
 ANISOTROPIC_RESOLUTIONS = ((4, 8), (6, 12), (8, 16), (10, 16), (10, 20), (10, 24), (12, 24), (16, 24), (16, 32))
 
 COAT = lj.Stack([lj.Interface(1.5, 0.3), lj.Medium(1.0, 0.95, lj.HenyeyGreenstein(0.7))], lj.Lambertian(0.5))
@@ -111,7 +111,7 @@ def study(
     size = size or (QUICK if quick else DEFAULT)
     surroundings = environment.describe()
     missing = {
-        name: reason if with_peers else "left out by request"
+        name: reason if with_peers else "omitted on request"
         for name, reason in (("PythonicDISORT", disort.why_not()), ("Mitsuba", peers.why_not()))
         if reason is not None or not with_peers
     }

@@ -1,6 +1,6 @@
-"""How fast all orders of scattering are to call, to differentiate, to fit and to sample: seconds beside what is asked.
+"""How fast all orders of scattering are to call, to differentiate, to fit and to sample: seconds beside the bars.
 
-One stack, a rough coat over haze on a diffuse base, 140 readings of a goniometer, six parameters.
+One stack, a rough coat over haze on a diffuse base, 140 measurements of a goniometer, six parameters.
 """
 
 from collections.abc import Callable, Sequence
@@ -45,10 +45,10 @@ FIRST_OF = {"evaluate": "`lj.evaluate`", "grad": "`jax.grad` of it"}
 TEXT = """\
 ## Speed of all orders
 
-Rough interface over haze over a diffuse base, six free parameters, {readings} readings at four incidences, one call
-from the parameters to the values. `AddingDoubling` runs at the first resolution of a series, from coarse to fine, whose
-largest error is below {error:g}. What is cold is measured in a process of its own, which keeps no compiled programs;
-the rest is warm, medians of interleaved rounds.
+Rough interface over haze over a diffuse base, six free parameters, {count} measurements at four incidences, one
+call from the parameters to the values. `AddingDoubling` runs at the first resolution of a series, from coarse to fine,
+whose largest error is below {error:g}. What is cold is measured in a process of its own, which keeps no compiled
+programs; the rest is warm, medians of interleaved rounds.
 
 {rows}"""
 
@@ -71,7 +71,7 @@ class Size:
 
 @dataclass(frozen=True)
 class Row:
-    """What was measured, in `unit`, beside what is asked for at least and aimed at."""
+    """What was measured, in `unit`, beside what is required and aimed at."""
 
     what: str
     unit: str
@@ -123,34 +123,34 @@ def warm(size: Size, with_disort: bool) -> tuple[list[Row], Work]:
         ratio = float(np.median(seconds["jacobian"] / CALLS / seconds["peer"]))
         note = (
             f"{figure(1e3 * float(np.median(seconds['peer'])))} ms for the haze on its base without the interface, "
-            f"which it lacks, at {peer.name} (error {peer.error:.0e}, viewers within 12 degrees of the normal left out)"
+            f"which it lacks, at {peer.name} (error {peer.error:.0e}, viewers within 12 degrees of the normal omitted)"
         )
         reached = reached and peer.error <= ERROR
         found.append(row("the same, relative to PythonicDISORT's value", "", ratio, RELATIVE, note, reached))
     return found, work
 
 
-def cold_rows(what: What, found: dict[str, float], work: Work) -> list[Row]:
+def cold_rows(what: What, results: dict[str, float], work: Work) -> list[Row]:
     """The rows of one measurement by a fresh process."""
     if what in COMPILE:
-        return [row(f"compile, {CALLED[what]}, cold", "s", found["seconds"], COMPILE[what])]
+        return [row(f"compile, {CALLED[what]}, cold", "s", results["seconds"], COMPILE[what])]
     if what in FIRST:
         name = f"first {FIRST_OF[what]}, the README's coat, fresh process"
-        return [row(name, "s", found["seconds"], FIRST[what], "after the imports" if what == "evaluate" else "")]
+        return [row(name, "s", results["seconds"], FIRST[what], "after the imports" if what == "evaluate" else "")]
     sampled = (
-        f"{found['effective']:,.0f} in {found['evaluations']:,.0f} steps of a walker, {found['acceptance']:.2f} of the "
-        "proposals taken; with its compilation"
+        f"{results['effective']:,.0f} in {results['evaluations']:,.0f} steps of a walker, {results['acceptance']:.2f} "
+        "of the proposals accepted; with its compilation"
     )
     return [
         row(
             f"fit of 6 parameters, {work.starts} starts, cold process",
             "s",
-            found["cold"],
+            results["cold"],
             COLD_FIT,
             "imports and compilation included",
         ),
-        row("the same, warm, of other data", "s", found["warm"], WARM_FIT),
-        row(f"{work.ess:,.0f} effective samples after the fit, exact", "s", found["sample"], SAMPLING, sampled),
+        row("the same, warm, of other data", "s", results["warm"], WARM_FIT),
+        row(f"{work.ess:,.0f} effective samples after the fit, exact", "s", results["sample"], SAMPLING, sampled),
     ]
 
 
@@ -160,23 +160,24 @@ def row(what: str, unit: str, measured: float, bar: Bar, note: str = "", reached
     return Row(what, unit, measured, bar.least, bar.aim, verdict, note)
 
 
-def markdown(found: Sequence[Row]) -> str:
+def markdown(rows: Sequence[Row]) -> str:
     """The section of the page: the table, with notes under it."""
     header = ("what", "unit", "measured", "at least", "aim", "verdict")
-    body = [(r.what, r.unit, figure(r.measured), f"{r.least:g}", f"{r.aim:g}", r.verdict) for r in found]
-    notes = "".join(f"- {r.what}: {r.note}.\n" for r in found if r.note)
-    return TEXT.format(readings=len(coated_haze.readings()), error=ERROR, rows=f"{table(header, body)}\n{notes}")
+    body = [(r.what, r.unit, figure(r.measured), f"{r.least:g}", f"{r.aim:g}", r.verdict) for r in rows]
+    notes = "".join(f"- {r.what}: {r.note}.\n" for r in rows if r.note)
+    count = len(coated_haze.goniometer_slices())
+    return TEXT.format(count=count, error=ERROR, rows=f"{table(header, body)}\n{notes}")
 
 
 def _goniometer(stack: lj.Stack, orders: Orders = "all") -> Floats:
-    """The readings, (N,), by what counts as exact."""
-    geometry, transport = coated_haze.readings(), lj.AddingDoubling(*FINEST, orders=orders)
+    """The values of all measurements, (N,), by what counts as exact."""
+    geometry, transport = coated_haze.goniometer_slices(), lj.AddingDoubling(*FINEST, orders=orders)
     return np.asarray(lj.evaluate(stack, geometry.wi, geometry.wo, transport))[:, 0]
 
 
 def _discrete_ordinates() -> Way:
-    """PythonicDISORT's readings of the haze on its base without the interface, as fast as it has the error."""
-    p, geometry = coated_haze.PARAMETERS, coated_haze.readings()
+    """PythonicDISORT's values of the haze on its base without the interface, as fast as it has the error."""
+    p, geometry = coated_haze.PARAMETERS, coated_haze.goniometer_slices()
     exact = _goniometer(lj.Stack([coated_haze.stack_of().layers[1]], lj.Lambertian(p["base"])))
     azimuth = np.abs(
         np.arctan2(geometry.wo[:, 1], geometry.wo[:, 0]) - np.arctan2(geometry.wi[:, 1], geometry.wi[:, 0])

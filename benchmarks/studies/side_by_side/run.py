@@ -209,7 +209,7 @@ def carried(models: Sequence[Model]) -> str:
 
 
 def cheapest(rows: Sequence[Row], limits: Mapping[str, float]) -> str:
-    """For every family and target the cheapest model and step. limits: error that the truth of each stack can tell."""
+    """For every family and target the cheapest model and step. limits: error of the truth of each stack."""
     lines = []
     for family, title in suite.FAMILIES.items():
         here = [row for row in rows if row.family == family]

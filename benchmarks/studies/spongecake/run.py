@@ -38,7 +38,7 @@ GAINS, QUICK_GAINS = (1024, 150), (64, 5)
 """Materials learned from, and epochs, where the gain of each step is measured."""
 
 ANGLES = (0.0, 30.0, 50.0, 70.0, 80.0)
-"""Of light in the furnace, degrees."""
+"""Degrees of incidence in the furnace."""
 
 NODES = 32
 """Quadrature of albedos."""
@@ -104,7 +104,7 @@ WAYS: tuple[Ready, ...] = (lobes_alone, partial(lj.prepare, transport=CAKE))
 
 
 def gains(work: Path, count: int, epochs: int, report: Callable[[str], None]) -> list[Gain]:
-    """What each step beyond the paper is worth: the same short training with more and more of them, one medium."""
+    """The gain of each step beyond the paper: the same short training with more and more of them, one medium."""
     for _ in materials.make(work, count, 1, "train", SEED):
         pass
     learned, test = materials.load(work, count, 1, "train", SEED), materials.load(work, count // 2, 1, "test", SEED)
@@ -234,8 +234,8 @@ def _values(samples: materials.Samples, ready: Ready) -> NDArray[np.float64]:
     for rows, make, numbers in _structures(samples):
 
         @eqx.filter_jit
-        def one(given: tuple, make: Callable = make) -> jax.Array:
-            numbers, wi, wo = given
+        def one(arguments: tuple, make: Callable = make) -> jax.Array:
+            numbers, wi, wo = arguments
             return lj.evaluate(ready(make(numbers)), wi[..., None, :], wo)[..., 0]
 
         found[rows] = jax.lax.map(one, (numbers, jnp.asarray(lit[rows]), jnp.asarray(samples.wo[rows])))

@@ -25,7 +25,7 @@ The same materials with albedo 1 and no Fresnel term, light at {angles} degrees:
 alone, and of `SpongeCake` as it is, with the factor that puts energies right.
 
 {furnace}
-## What each step is worth
+## The gain of each step
 
 The same short training each time (one medium, {gain_materials:,} materials, {gain_epochs} epochs), half as many held
 out: errors as above, and those of the energy of lossless materials, the mean over 12 angles of |R + T - truth|, each
@@ -141,7 +141,7 @@ class Settings:
     """How much was measured.
 
     counts: slabs of one medium and of two. angles: of light in the furnace, degrees. paths: of the walk. rounds: of
-    timing. gain_materials, gain_epochs: of the training that says what each step is worth.
+    timing. gain_materials, gain_epochs: of the training that measures the gain of each step.
     """
 
     counts: tuple[int, int]
@@ -164,7 +164,7 @@ class Findings:
     costs: list[Cost] = field(default_factory=list)
 
 
-def markdown(surroundings: dict[str, Any], settings: Settings, found: Findings) -> str:
+def markdown(surroundings: dict[str, Any], settings: Settings, findings: Findings) -> str:
     """The page of results: words, and a table a section."""
     return TEXT.format(
         environment=environment_lines(surroundings),
@@ -175,14 +175,14 @@ def markdown(surroundings: dict[str, Any], settings: Settings, found: Findings) 
         rounds=settings.rounds,
         gain_materials=settings.gain_materials,
         gain_epochs=settings.gain_epochs,
-        errors=_errors_table(found.errors),
-        furnace=_furnace_table(found.furnace),
-        gains=_gains_table(found.gains),
-        figures=_figures_table(found.figures),
-        fits=_fits_table(found.fits),
-        closer=sum(row.cake_bias < row.first_bias for row in found.fits),
-        all=len(found.fits),
-        costs=_costs_table(found.costs),
+        errors=_errors_table(findings.errors),
+        furnace=_furnace_table(findings.furnace),
+        gains=_gains_table(findings.gains),
+        figures=_figures_table(findings.figures),
+        fits=_fits_table(findings.fits),
+        closer=sum(row.cake_bias < row.first_bias for row in findings.fits),
+        all=len(findings.fits),
+        costs=_costs_table(findings.costs),
     )
 
 

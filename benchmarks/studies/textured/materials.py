@@ -133,7 +133,7 @@ PRINCIPLED = {
     "clearcoat": Range(0.0, 1.0),
     "clearcoat_gloss": Range(0.0, 1.0),
 }
-"""Of Mitsuba's BSDF of that name: a metal or a diffuse base, and a coat over either."""
+"""Parameters of Mitsuba's BSDF of that name: a metal or a diffuse base, and a coat over either."""
 
 CONDUCTOR = {"eta": METAL["metal"], "k": METAL["k"], "alpha": METAL["metal alpha"]}
-"""Of its rough metal."""
+"""Parameters of its rough metal."""

@@ -25,9 +25,9 @@ NAME = "textured"
 BRIGHTER = 1.1
 """The loss is the mean squared difference from the values times this."""
 PROBED = 4096
-"""Texels by which the time of a map is estimated; smaller maps than were asked for have a multiple of them."""
+"""Texels by which the time of a map is estimated; smaller maps than requested have a multiple of them."""
 MANY = 500_000
-"""Texels of a map that tells how memory grows: what is held for the last block of a smaller one outweighs it."""
+"""Texels from which on bytes a texel are measured: in smaller maps what the last block holds outweighs them."""
 GRADIENT, COMPILE, COMPILE_GRADIENT, TO_PRINCIPLED = Bar(5.0, 3.0), Bar(3.0, 1.5), Bar(8.0, 4.0), Bar(5.0, 2.0)
 """In times of a value; in seconds; in times of Mitsuba's principled BSDF."""
 
@@ -38,8 +38,8 @@ TEXT = """\
 Every texel is a stack of its own, of which each parameter is a map, under a pair of directions of its own. Medians of
 {rounds} rounds, everything compiled; *gradient* is a value with the derivatives of a mean squared difference in all
 parameter maps, in values; *memory* is what the program of a value holds beside inputs and results, and grows by with
-each texel, of {many:,} and more. Where a few texels say that a map takes longer than {longest:g} s, fewer *texels*
-stand for it. *principled* and *conductor* are times of our value over those of Mitsuba's `principled` and
+each texel, of {many:,} and more. Where a map would take longer than {longest:g} s, by the time of a few texels, it
+has fewer *texels*. *principled* and *conductor* are times of our value over those of Mitsuba's `principled` and
 `roughconductor` (`llvm_ad_rgb`, float32) with a texture for every parameter, in the same rounds. {peers}
 
 {rows}
@@ -96,7 +96,7 @@ def study(
     """Measure, and write ``textured.json`` and ``textured.md``; returns the markdown and the two paths."""
     size = size or (QUICK if quick else Size())
     surroundings = environment.describe()
-    missing = peers.why_not() if with_peers else "left out by request"
+    missing = peers.why_not() if with_peers else "omitted on request"
     rows: list[Row] = []
     for material in materials:
         for precision in size.precisions:
@@ -125,7 +125,7 @@ def study(
 
 
 def measure(material: Material, precision: str, texels: int, size: Size, with_peers: bool) -> Row:
-    """One row; of fewer texels than are asked for where these would take too long."""
+    """One row; of fewer texels than requested where these would take too long."""
     probed = min(PROBED, texels)
     few = _Problem(material, precision, probed)
     seconds = min(once(few.compiled_value()[0]) for _ in range(2))
@@ -147,13 +147,13 @@ def measure(material: Material, precision: str, texels: int, size: Size, with_pe
         gradient=1.0 / ratios["gradient"],
         compile_value=compile_value,
         compile_gradient=compile_gradient,
-        memory=_growth(problem, memory) if count >= MANY else None,
+        memory=_memory_of_a_texel(problem, memory) if count >= MANY else None,
         principled=ratios.get("principled"),
         conductor=ratios.get("conductor"),
     )
 
 
-def _growth(problem: "_Problem", memory: float) -> float:
+def _memory_of_a_texel(problem: "_Problem", memory: float) -> float:
     """Bytes that each texel adds, by a map of half as many."""
     half = _Problem(problem.material, problem.precision, problem.texels // 2)
     return (memory - half.compiled_value()[2]) / (problem.texels - half.texels)
@@ -224,10 +224,10 @@ def _verdicts(materials: Sequence[Material], rows: Sequence[Row]) -> str:
         if material.least is None:
             continue
         bar = Bar(material.least, material.least if material.aim is None else material.aim)
-        found = [row for row in rows if row.material == material.name]
+        of_material = [row for row in rows if row.material == material.name]
 
-        def slowest(bar: Bar, name: str, found: Sequence[Row] = found) -> str:
-            values = [getattr(row, name) for row in found if getattr(row, name) is not None]
+        def slowest(bar: Bar, name: str, rows: Sequence[Row] = of_material) -> str:
+            values = [getattr(row, name) for row in rows if getattr(row, name) is not None]
             return bar.verdict(max(values)) if values else "no peer"
 
         lines.append(

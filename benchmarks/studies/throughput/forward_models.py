@@ -73,7 +73,7 @@ class Row:
 
 
 def run(size: Size, peers_missing: str | None, report: Callable[[str], None]) -> list[Row]:
-    """Measure the scenes in each precision; `peers_missing` says why the peers are left out, if they are."""
+    """Measure the scenes in each precision; `peers_missing` says why the peers are omitted, if they are."""
     rows = []
     for scene in size.scenes:
         for precision in size.precisions:

@@ -48,7 +48,7 @@ def study(
     forward_size = forward_size or (forward_models.QUICK if quick else forward_models.DEFAULT)
     fitting_size = fitting_size or (fitting.QUICK if quick else fitting.DEFAULT)
     surroundings = environment.describe()
-    missing = peers.why_not() if with_peers else "left out by request"
+    missing = peers.why_not() if with_peers else "omitted on request"
     forward = forward_models.run(forward_size, missing, report)
     inference = fitting.run(fitting_size, report)
     found = "Peers: Mitsuba 3 and Dr.Jit, same run." if missing is None else f"Peers did not run: {missing}."

@@ -11,6 +11,7 @@ import dataclasses
 import sys
 import warnings
 from collections.abc import Sequence
+from contextlib import nullcontext
 from functools import partial
 from typing import Any, ClassVar, Literal, get_args
 
@@ -378,7 +379,8 @@ class AddingDoubling(DeterministicTransport):
                 f"AddingDoubling.tolerance: {self.tolerance:g} needs concrete parameters: "
                 "prepare the stack outside jit, grad and vmap, or give nodes and modes"
             )
-        with jax.ensure_compile_time_eval():
+        # within a program that is traced its own are to be run; outside, their constants need none of their own
+        with nullcontext() if is_outermost(stack) else jax.ensure_compile_time_eval():
             return self._agreeing(stack, None if is_traced(known) else known)
 
     def _agreeing(self, stack: Stack, known: KnownDirections | None) -> "AddingDoubling":
@@ -389,15 +391,7 @@ class AddingDoubling(DeterministicTransport):
         for rung in rungs(stack):
             options = self._at(rung)
             state = options.prepare_for(stack, partial(known_directions, wi, wo) if known is not None else lambda: None)
-            values = options.measured(state, wi, wo, "all", channel_count(stack), None)[0]
-            # what is known in closed form does not change, and where it is a narrow peak it must not set the scale
-            solved, without = (
-                dataclasses.replace(options, orders="multiple"),
-                dataclasses.replace(state, ballistic=None),
-            )
-            found = solved.measured(without, wi, wo, "all", channel_count(stack), None)[0]
-            without = dataclasses.replace(without, scaled=None)
-            rest = solved.measured(without, wi, wo, "all", channel_count(stack), None)[0]
+            values, found, rest = _at_probes(options, state, wi, wo, channel_count(stack))
             if before is not None:
                 change = float(jnp.max(safe_div(jnp.abs(found - before), values + 0.1 * jnp.mean(rest))))
                 if change <= self.tolerance:
@@ -428,6 +422,21 @@ class _Planned(AddingDoubling):
         if self.elements is None:
             return super()._solve_between(stack, known, plan)
         return _values_between(stack, make_elements(stack, plan, known, replay(self.elements)), known, plan)
+
+
+@filter_jit
+@exact_products
+def _at_probes(
+    options: AddingDoubling, state: Solved, wi: Array, wo: Array, channels: int
+) -> tuple[Array, Array, Array]:
+    """Values; what of them is solved; and that without what media that were scaled lack.
+
+    What is known in closed form does not change, and where it is a narrow peak it must not set the scale.
+    """
+    solved, without = dataclasses.replace(options, orders="multiple"), dataclasses.replace(state, ballistic=None)
+    of = (options, state), (solved, without), (solved, dataclasses.replace(without, scaled=None))
+    values, found, rest = (how.measured(what, wi, wo, "all", channels, None)[0] for how, what in of)
+    return values, found, rest
 
 
 def _ballistic(state: Solved, wi: Vector, wo: Vector, side: Side) -> list[Channels]:

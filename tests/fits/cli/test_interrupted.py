@@ -1,12 +1,7 @@
 """Commands that are interrupted or killed, full disks, and processes that meet: what was kept stays, and is resumed."""
 
-import os
-import shutil
 import signal
-import subprocess
 import sys
-import time
-from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -15,7 +10,6 @@ import pytest
 
 from fits.cli.parser import main
 from fits.optimise import multi_start as starts
-from fits.optimise.result import Fit
 from fits.reports.html import FitReport
 from fits.reports.plots.data import data_picture
 from fits.reports.results import load_fit, load_posterior, save_fit
@@ -23,14 +17,14 @@ from fits.sampling.sample import sample
 from fits.store import Store
 from tests.helpers.coats import make_folder
 from tests.helpers.files import contents, largest_file, read_only
-from tests.helpers.places import ROOT
+from tests.helpers.tasks import started, wait_until
 
 FIT = ["fit", "data.csv", "--stack", "coat.toml", "--out", "result"]
 MANY_STARTS = [*FIT, "--starts", "200"]
 FIT_MANY = ["fit-many", "scans", "--stacks", "bare.toml", "--out", "out", "--starts", "2", "--processes", "1"]
 
 
-def refusal(words: list[str], capsys: pytest.CaptureFixture[str]) -> str:
+def refusal(words, capsys):
     """The one error line of a command that must fail, after what it says of its progress."""
     assert main(words) == 2
     *progress, error = capsys.readouterr().err.splitlines()
@@ -40,20 +34,13 @@ def refusal(words: list[str], capsys: pytest.CaptureFixture[str]) -> str:
 
 
 @contextmanager
-def stopped(words: list[str], cache: Path, when: Callable[[], bool]) -> Iterator[subprocess.Popen]:
+def stopped(words, when):
     """A `layerjax` command in a process of its own, held where it is once `when` is true, and killed in the end."""
-    environment = os.environ | {"PYTHONPATH": str(ROOT), "XDG_CACHE_HOME": str(cache)}
-    with subprocess.Popen([sys.executable, "-m", "fits.cli", *words], env=environment, text=True) as process:
-        try:
-            end = time.monotonic() + 100
-            while not when():
-                assert process.poll() is None, "it ended too soon"
-                assert time.monotonic() < end, "it never got there"
-                time.sleep(0.0005)
-            process.send_signal(signal.SIGSTOP)
-            yield process
-        finally:
-            process.kill()
+    with started(["-m", "fits.cli", *words]) as process:
+        wait_until(lambda: process.poll() is not None or when())
+        assert process.poll() is None, "it ended too soon"
+        process.send_signal(signal.SIGSTOP)
+        yield process
 
 
 @pytest.mark.parametrize(
@@ -64,16 +51,8 @@ def stopped(words: list[str], cache: Path, when: Callable[[], bool]) -> Iterator
         ("fits.structure_search.search", ["search", "data.csv", "--out", "out"], "out keeps what was fitted"),
     ],
 )
-def test_an_interrupt_says_how_to_resume(
-    work: Path,
-    capsys: pytest.CaptureFixture[str],
-    coat_fit: Fit,
-    monkeypatch: pytest.MonkeyPatch,
-    place: str,
-    words: list[str],
-    hint: str,
-) -> None:
-    def interrupted(*_: object, **__: object) -> None:
+def test_an_interrupt_says_how_to_resume(work, capsys, coat_fit, monkeypatch, place, words, hint):
+    def interrupted(*_, **__):
         raise KeyboardInterrupt
 
     save_fit(coat_fit, "result")
@@ -82,30 +61,6 @@ def test_an_interrupt_says_how_to_resume(
     assert main(words) == 130
     assert hint in capsys.readouterr().err
     assert (work / "out" / "table.csv").is_file() == (words is FIT_MANY)
-
-
-def test_an_interrupted_fit_exits_with_130_and_leaves_its_starts_alone(work: Path) -> None:
-    before = contents(work)
-    command = [sys.executable, "-m", "fits.cli", *FIT, "--starts", "100000"]
-    environment = os.environ | {"PYTHONPATH": str(ROOT), "XDG_CACHE_HOME": str(work.parent / "cache")}
-    ours = signal.signal(signal.SIGINT, signal.default_int_handler)  # a background job's ignoring would be inherited
-    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=environment)
-    signal.signal(signal.SIGINT, ours)
-    assert process.stderr is not None
-    first = process.stderr.readline()
-    process.send_signal(signal.SIGINT)
-    try:
-        _, error = process.communicate(timeout=60)
-    finally:
-        process.kill()
-    assert first.startswith("layerjax: fit ")
-    assert process.returncode == 130
-    assert error.splitlines()[-1] == (
-        "layerjax: interrupted: result was not written; the same command resumes with the starts that are done"
-    )
-    after = contents(work)
-    assert after.pop(str(work / ".result.starts"))
-    assert after == before
 
 
 @pytest.mark.parametrize(
@@ -121,14 +76,7 @@ def test_an_interrupted_fit_exits_with_130_and_leaves_its_starts_alone(work: Pat
     ],
     ids=lambda value: value[0] if isinstance(value, list) else "",
 )
-def test_a_full_disk_is_one_line_and_changes_nothing(
-    work: Path,
-    capsys: pytest.CaptureFixture[str],
-    coat_fit: Fit,
-    words: list[str],
-    name: str,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_full_disk_is_one_line_and_changes_nothing(work, capsys, coat_fit, words, name, monkeypatch):
     # any picture will do, and this one is drawn fast
     monkeypatch.setattr("fits.reports.render.render", lambda *_, **__: data_picture(coat_fit.problem.data))
     for directory in ("one", "two"):
@@ -145,9 +93,7 @@ def test_a_full_disk_is_one_line_and_changes_nothing(
     assert after == before
 
 
-def test_a_full_disk_behind_stdout_is_one_line(
-    work: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_full_disk_behind_stdout_is_one_line(work, capsys, monkeypatch):
     if not Path("/dev/full").exists():
         pytest.skip("there is no /dev/full")
     with open("/dev/full", "w") as full:  # closing it fails if anything is left to be written
@@ -155,9 +101,7 @@ def test_a_full_disk_behind_stdout_is_one_line(
         assert "No space left on device" in refusal(["convert", "data.csv", "out.csv"], capsys)
 
 
-def test_the_report_of_a_result_that_can_only_be_read_goes_elsewhere(
-    work: Path, capsys: pytest.CaptureFixture[str], coat_fit: Fit
-) -> None:
+def test_the_report_of_a_result_that_can_only_be_read_goes_elsewhere(work, capsys, coat_fit):
     save_fit(coat_fit, "result")
     with read_only(work / "result"):
         assert "(--out FILE writes the report elsewhere)" in refusal(["report", "result"], capsys)
@@ -167,9 +111,7 @@ def test_the_report_of_a_result_that_can_only_be_read_goes_elsewhere(
     assert "--force" in refusal(["report", "result", "--out", "report.html"], capsys)
 
 
-def test_a_fit_on_a_full_disk_keeps_its_starts_and_the_earlier_result(
-    work: Path, capsys: pytest.CaptureFixture[str], coat_fit: Fit, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_fit_on_a_full_disk_keeps_its_starts_and_the_earlier_result(work, capsys, coat_fit, monkeypatch):
     save_fit(coat_fit, "result")
     before = contents(work)
     words = [*FIT, "--starts", "3", "--force"]
@@ -185,62 +127,48 @@ def test_a_fit_on_a_full_disk_keeps_its_starts_and_the_earlier_result(
     assert not list(work.glob(".*"))
 
 
-def test_beside_a_running_sampler_others_only_read(
-    work: Path,
-    capsys: pytest.CaptureFixture[str],
-    coat_fit: Fit,
-    tmp_path_factory: pytest.TempPathFactory,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_beside_a_running_sampler_others_only_read(work, capsys, coat_fit, monkeypatch):
     monkeypatch.setattr(FitReport, "page", lambda _: "drawn")
     for name in ("result", "other"):
         save_fit(coat_fit, name)
-    directory = work / "result"
-    words = ["sample", "result", "--walkers", "32", "--ess", "6000"]
-
-    def state() -> dict[str, tuple[int, int, bytes]]:
-        entries = [(path, path.stat()) for path in directory.iterdir()]
-        return {path.name: (stat.st_ino, stat.st_mtime_ns, path.read_bytes()) for path, stat in entries}
-
-    def some_steps() -> bool:
-        return (directory / "chain.db").is_file() and (directory / "chain.db").stat().st_size > 30_000
-
-    with stopped(words, tmp_path_factory.getbasetemp() / "cache", some_steps) as process:
-        before = state()
-        assert {"chain.db", "chain.db.lock"} < set(before)
+    directory, chain = work / "result", work / "result" / "chain.db"
+    words = ["sample", "result", "--walkers", "32", "--ess", "1000"]
+    with stopped(words, lambda: chain.is_file() and chain.stat().st_size > 30_000) as process:
+        before = contents(directory)
+        assert {str(chain), f"{chain}.lock"} < set(before)
         for other in (words, [*words, "--force"], [*MANY_STARTS, "--force"]):
             assert f"in use by another process ({process.pid})" in refusal(other, capsys)
         posterior = load_posterior(directory)
         assert main(["compare", "result", "other", "--no-refit"]) == 0
         assert main(["report", "result", "--out", "report.html"]) == 0
-        assert state() == before
+        assert contents(directory) == before
     assert process.returncode == -signal.SIGKILL
     assert posterior is not None
     loaded = load_fit(directory)
-    whole = sample(loaded, walkers=32, seed=0, path=directory / "chain.db", ess=6_000)
-    again = sample(loaded, walkers=32, seed=0, ess=6_000)
+    whole = sample(loaded, walkers=32, seed=0, path=chain, ess=1_000)
+    again = sample(loaded, walkers=32, seed=0, ess=1_000)
     assert 0 < len(posterior.chain) < len(again.chain)
     np.testing.assert_array_equal(posterior.chain, again.chain[: len(posterior.chain)])
     np.testing.assert_array_equal(whole.chain, again.chain)
     assert not (directory / "chain.db.lock").exists()
 
 
-def test_a_killed_fit_goes_on_with_the_starts_that_are_done(
-    work: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-    tmp_path_factory: pytest.TempPathFactory,
-) -> None:
+def test_an_interrupted_fit_exits_with_130_and_the_next_resumes_with_the_starts_that_are_done(
+    work, capsys, monkeypatch
+):
     done = work / ".result.starts"
-
-    def some_starts() -> bool:
-        return done.is_file() and len(Store.read(done).keys()) > 2
-
-    with stopped(MANY_STARTS, tmp_path_factory.getbasetemp() / "cache", some_starts) as process:
+    with stopped(MANY_STARTS, lambda: done.is_file() and len(Store.read(done).keys()) > 2) as process:
         before = contents(work)
         assert f"result is in use by another process ({process.pid})" in refusal(MANY_STARTS, capsys)
-        kept = len(Store.read(done).keys())
         assert contents(work) == before
+        process.send_signal(signal.SIGINT)
+        process.send_signal(signal.SIGCONT)
+        _, error = process.communicate(timeout=60)
+    assert process.returncode == 130
+    words = "result was not written; the same command resumes with the starts that are done"
+    assert error.splitlines()[-1] == f"layerjax: interrupted: {words}"
+    assert not (work / "result").exists()
+    kept = len(Store.read(done).keys())
     assert 2 < kept < 200
     solve, solved = starts.rough_descent, []
     monkeypatch.setattr(starts, "rough_descent", lambda *given, **how: solved.append(how) or solve(*given, **how))
@@ -251,33 +179,3 @@ def test_a_killed_fit_goes_on_with_the_starts_that_are_done(
     assert main([*MANY_STARTS[:-3], "whole", *MANY_STARTS[-2:]]) == 0
     for name in ("fit.json", "fitted.toml", "data.csv"):
         assert (work / "result" / name).read_bytes() == (work / "whole" / name).read_bytes()
-
-
-def test_a_killed_batch_goes_on_with_the_fits_that_are_done(
-    work: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-    tmp_path_factory: pytest.TempPathFactory,
-) -> None:
-    (work / "scans").mkdir()
-    for name in ("a.csv", "b.csv"):
-        shutil.copy("data.csv", work / "scans" / name)
-    words = ["fit-many", "scans", "--stacks", "coat.toml", "--starts", "2", "--processes", "1", "--out"]
-    store = work / "out" / "batch.store"
-
-    def one_is_done() -> bool:
-        return store.is_file() and Store.read(store).get("a.csv/coat") is not None
-
-    with stopped([*words, "out"], tmp_path_factory.getbasetemp() / "cache", one_is_done) as process:
-        before = contents(work)
-        assert f"in use by another process ({process.pid})" in refusal([*words, "out"], capsys)
-        assert contents(work) == before
-    first = before[str(work / "out" / "a.csv" / "coat" / "fit.json")]
-    monkeypatch.setattr(FitReport, "write", lambda *_: None)
-    for out in ("out", "whole"):
-        assert main([*words, out]) == 0
-    assert (work / "out" / "a.csv" / "coat" / "fit.json").read_bytes() == first  # not fitted again
-    for name in ("a.csv", "b.csv"):
-        one, other = (load_fit(work / out / name / "coat") for out in ("out", "whole"))
-        np.testing.assert_array_equal(one.vector, other.vector)
-    assert not list((work / "out").rglob(".*"))

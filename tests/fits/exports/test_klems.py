@@ -1,8 +1,6 @@
 """Matrices of WINDOW: sums, symmetries and sides, beside the stack; the readers of others are in `test_readers`."""
 
 import xml.etree.ElementTree as ElementTree
-from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,9 +13,11 @@ FIBERS = lj.Medium(0.7, 0.9, lj.SGGX("fiber", 0.4, (1.0, 0.5, 0.6)))
 SHEET = lj.Stack([lj.Medium(0.3, 0.0), FIBERS])  # what absorbs is on top: front and back differ
 COUNTS = (1, 8, 16, 20, 24, 24, 24, 16, 12)
 BOUNDS = (0, 5, 15, 25, 35, 45, 55, 65, 75, 90)
+WHITE = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
+"""From linear sRGB to XYZ, by the matrix that the standard gives (IEC 61966-2-1)."""
 
 
-def matrices(path: Path) -> dict[tuple[str, str], np.ndarray]:
+def matrices(path):
     """By wavelength and direction, rows of light that leaves."""
     name = "{http://windows.lbl.gov}"
     found = {}
@@ -30,25 +30,25 @@ def matrices(path: Path) -> dict[tuple[str, str], np.ndarray]:
     return found
 
 
-def projected_solid_angles() -> np.ndarray:
+def projected_solid_angles():
     """Of the patches, from the basis as it is published."""
     cosines = np.cos(np.radians(BOUNDS)) ** 2
     return np.repeat(np.pi * (cosines[:-1] - cosines[1:]) / COUNTS, COUNTS)
 
 
 @pytest.fixture(scope="module")
-def sheet_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def sheet_file(tmp_path_factory):
     path = tmp_path_factory.mktemp("klems") / "sheet.xml"
     fits.export(SHEET, path, "klems", transport=TRANSPORT)
     return path
 
 
 @pytest.fixture(scope="module")
-def sheet(sheet_file: Path) -> dict[tuple[str, str], np.ndarray]:
+def sheet(sheet_file):
     return matrices(sheet_file)
 
 
-def test_columns_hold_what_the_stack_sends(sheet: dict[tuple[str, str], np.ndarray]) -> None:
+def test_columns_hold_what_the_stack_sends(sheet):
     projected = projected_solid_angles()
     assert projected.sum() == pytest.approx(np.pi)
     assert {direction for _, direction in sheet} == {
@@ -64,44 +64,27 @@ def test_columns_hold_what_the_stack_sends(sheet: dict[tuple[str, str], np.ndarr
         assert sums["Transmission"][0] == pytest.approx(passed + straight, rel=0.01)
 
 
-def test_light_may_go_back_the_way_it_came(sheet: dict[tuple[str, str], np.ndarray]) -> None:
-    """Reciprocity between patches: that of light which leaves is opposite in azimuth to that it would come by."""
-    opposite = []
-    first = 0
-    for count in COUNTS:
-        opposite += [first + (place + count // 2) % count for place in range(count)]
-        first += count
-    for side in ("Front", "Back"):
-        matrix = sheet["Visible", f"Reflection {side}"]
-        np.testing.assert_allclose(matrix, matrix[np.ix_(opposite, opposite)].T, rtol=0.1, atol=1e-4)
-    through, back = sheet["Visible", "Transmission Front"], sheet["Visible", "Transmission Back"]
-    np.testing.assert_allclose(through, back[np.ix_(opposite, opposite)].T, rtol=0.1, atol=1e-3)
-
-
-def test_unscattered_light_stays_in_its_patch(tmp_path: Path) -> None:
+def test_unscattered_light_stays_in_its_patch(tmp_path):
     fits.export(lj.Stack([lj.Medium(0.5, 0.0)]), tmp_path / "dye.xml", "klems", transport=TRANSPORT)
     matrix = matrices(tmp_path / "dye.xml")["Visible", "Transmission Front"]
     assert np.count_nonzero(matrix) == 145
-    squares = [
-        np.linspace(*np.sin(np.radians(ring)) ** 2, 20001) for ring in pairwise(BOUNDS)
-    ]  # of sines: even in flux
-    passed = [np.mean(np.exp(-0.5 / np.sqrt(np.maximum(1.0 - square, 1e-12)))) for square in squares]
+    squares = np.linspace(*np.sin(np.radians([BOUNDS[:-1], BOUNDS[1:]])) ** 2, 20001)  # of sines: even in flux
+    passed = np.mean(np.exp(-0.5 / np.sqrt(np.maximum(1.0 - squares, 1e-12))), axis=0)
     found = np.diag(matrix) * projected_solid_angles()
     np.testing.assert_allclose(found, np.repeat(passed, COUNTS), rtol=1e-3, atol=1e-4)
 
 
-def test_colours_are_xyz_and_an_opaque_stack_has_no_back(tmp_path: Path) -> None:
+def test_colours_are_xyz_and_an_opaque_stack_has_no_back(tmp_path):
     stack = lj.Stack([], lj.Lambertian([0.8, 0.4, 0.2]))
     done = fits.export(stack, tmp_path / "paint.xml", "klems")
     found = matrices(tmp_path / "paint.xml")
     assert {direction for _, direction in found} == {"Reflection Front"}
     assert any("opaque: no data of the back" in note for note in done.notes)
-    white = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
-    for wavelength, value in zip(("CIE-X", "Visible", "CIE-Z"), white @ [0.8, 0.4, 0.2], strict=True):
+    for wavelength, value in zip(("CIE-X", "Visible", "CIE-Z"), WHITE @ [0.8, 0.4, 0.2], strict=True):
         np.testing.assert_allclose(found[wavelength, "Reflection Front"], value / np.pi, rtol=1e-5)
 
 
-def test_a_stack_that_ends_in_glass_is_refused(tmp_path: Path) -> None:
+def test_a_stack_that_ends_in_glass_is_refused(tmp_path):
     with pytest.raises(ValueError, match=r"ends in a medium of index 1\.5"):
         fits.export(lj.Stack([lj.Interface(1.5, 0.1)]), tmp_path / "glass.xml", "klems", transport=lj.ENDF())
     with pytest.raises(ValueError, match="one channel or three"):
@@ -109,7 +92,7 @@ def test_a_stack_that_ends_in_glass_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_what_is_written_is_read(tmp_path: Path) -> None:
+def test_what_is_written_is_read(tmp_path):
     """At the middles of patches: means over these, which a smooth sheet has there to some percent."""
     haze = lj.Stack([lj.Medium(0.3, 0.0), lj.Medium(0.7, [0.9, 0.6, 0.3], lj.HenyeyGreenstein(0.1))])
     path = tmp_path / "haze.xml"
@@ -119,17 +102,16 @@ def test_what_is_written_is_read(tmp_path: Path) -> None:
     assert len(data) == 4 * 145**2
     assert np.count_nonzero(~data.mask) == 2 * 145
     seen = data.mask & (abs(data.wi[:, 2]) > np.cos(np.radians(65))) & (abs(data.wo[:, 2]) > np.cos(np.radians(65)))
-    white = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
-    true = np.asarray(lj.evaluate(haze, data.wi[seen], data.wo[seen], TRANSPORT)) @ white.T
+    true = np.asarray(lj.evaluate(haze, data.wi[seen], data.wo[seen], TRANSPORT)) @ WHITE.T
     np.testing.assert_allclose(data.values[seen], true, rtol=0.03)
 
 
-def test_axes_are_not_turned(sheet_file: Path) -> None:
+def test_axes_are_not_turned(sheet_file):
     """Fibers that lean: of every other orientation the readings would be another material's."""
     data = fits.read(sheet_file).used()
     steep = (abs(data.wi[:, 2]) > 0.5) & (abs(data.wo[:, 2]) > 0.5)
 
-    def apart(mirror: tuple[float, float, float]) -> float:
+    def apart(mirror):
         wi, wo = data.wi[steep] * mirror, data.wo[steep] * mirror
         true = np.asarray(lj.evaluate(SHEET, wi, wo, TRANSPORT))
         return float(np.sqrt(np.mean((data.values[steep] - true) ** 2)) / np.sqrt(np.mean(true**2)))
@@ -139,39 +121,39 @@ def test_axes_are_not_turned(sheet_file: Path) -> None:
         assert apart(mirror) > 0.3
 
 
-FAULTS = {
-    "no XML": (b"</WindowElement>", b"</WindowElemen>", "not well-formed XML"),
-    "another file": (b"WindowElement", b"Drawing", "an XML file of <Drawing>"),
-    "structure": (b">Columns<", b">TensorTree5<", "IncidentDataStructure is 'tensortree5'"),
-    "basis": (b"<RowAngleBasis>LBNL", b"<RowAngleBasis>LBL", "RowAngleBasis is"),
-    "patches": (b"<nPhis>8<", b"<nPhis>7<", "must be 144 x 144"),
-    "ring": (b"<UpperTheta>15<", b"<UpperTheta>150<", "a ring from 5 to 150 degrees"),
-    "bound": (b"<UpperTheta>15<", b"<UpperTheta>x<", "ThetaBounds/UpperTheta is 'x', must be a number"),
-    "direction": (b"Reflection Front", b"Reflection Left", "WavelengthDataDirection is 'reflection left'"),
-    "wavelength": (b">Visible<", b">Solar<", "no WavelengthData of 'Visible'"),
-    "number": (b"e-01,", b"e-x1,", "could not convert"),
-    "infinite": (b"2.546479e-01,", b"inf,", "holds inf, must be finite"),
-}
+FAULTS = (
+    (b"</WindowElement>", b"</WindowElemen>", "not well-formed XML"),
+    (b"WindowElement", b"Drawing", "an XML file of <Drawing>"),
+    (b">Columns<", b">TensorTree5<", "IncidentDataStructure is 'tensortree5'"),
+    (b"<RowAngleBasis>LBNL", b"<RowAngleBasis>LBL", "RowAngleBasis is"),
+    (b"<nPhis>8<", b"<nPhis>7<", "must be 144 x 144"),
+    (b"<UpperTheta>15<", b"<UpperTheta>150<", "a ring from 5 to 150 degrees"),
+    (b"<UpperTheta>15<", b"<UpperTheta>x<", "ThetaBounds/UpperTheta is 'x', must be a number"),
+    (b"Reflection Front", b"Reflection Left", "WavelengthDataDirection is 'reflection left'"),
+    (b">Visible<", b">Solar<", "no WavelengthData of 'Visible'"),
+    (b"e-01,", b"e-x1,", "could not convert"),
+    (b"2.546479e-01,", b"inf,", "holds inf, must be finite"),
+)
 
 
 @pytest.fixture(scope="module")
-def grey(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+def grey(tmp_path_factory):
     path = tmp_path_factory.mktemp("klems") / "grey.xml"
     fits.export(lj.Stack([], lj.Lambertian(0.8)), path, "klems")
     return path.read_bytes()
 
 
-@pytest.mark.parametrize(("old", "new", "message"), FAULTS.values(), ids=FAULTS)
-def test_what_is_wrong_is_named(tmp_path: Path, grey: bytes, old: bytes, new: bytes, message: str) -> None:
+def test_what_is_wrong_is_named(tmp_path, grey):
     bad = tmp_path / "bad.xml"
-    assert old in grey
-    bad.write_bytes(grey.replace(old, new))
-    with pytest.raises(ValueError, match=message) as error:
-        fits.read(bad)
-    assert str(error.value).startswith(f"{bad}: ")
+    for old, new, message in FAULTS:
+        assert old in grey
+        bad.write_bytes(grey.replace(old, new))
+        with pytest.raises(ValueError, match=message) as error:
+            fits.read(bad)
+        assert str(error.value).startswith(f"{bad}: ")
 
 
-def test_blocks_that_the_visible_lacks_are_left_out(tmp_path: Path, grey: bytes) -> None:
+def test_blocks_that_the_visible_lacks_are_left_out(tmp_path, grey):
     start, end = grey.index(b"<WavelengthData>"), grey.index(b"</WavelengthData>") + len(b"</WavelengthData>")
     more = grey[start:end].replace(b">Visible<", b">CIE-X<").replace(b"Reflection Front", b"Reflection Back")
     path = tmp_path / "two.xml"

@@ -2,7 +2,6 @@
 
 import contextlib
 import io
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,7 +18,7 @@ SHEET = lj.Stack([lj.Medium(0.3, 0.0), lj.Medium(0.7, 0.9, lj.SGGX("fiber", 0.4,
 
 
 @pytest.fixture(scope="module", params=["rough", "glossy"])
-def measured(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory):
+def measured(request, tmp_path_factory):
     """A stack, its transport, and its file."""
     stack, transport = (ROUGH, lj.SingleScattering()) if request.param == "rough" else (GLOSSY, lj.Statistical())
     path = tmp_path_factory.mktemp("rgl") / f"{request.param}.bsdf"
@@ -27,7 +26,7 @@ def measured(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFa
     return stack, transport, path
 
 
-def test_mitsuba_finds_the_stack(measured) -> None:
+def test_mitsuba_finds_the_stack(measured):
     """To 1 %, 0.3 % in the median."""
     mi = pytest.importorskip("mitsuba")
     mi.set_variant("scalar_rgb")
@@ -46,7 +45,7 @@ def test_mitsuba_finds_the_stack(measured) -> None:
 
 
 @pytest.mark.parametrize("light", [(0.3, 0.2, 0.93), (0.8, 0.0, 0.6)])
-def test_mitsuba_draws_as_the_file_says(measured, light: tuple[float, float, float]) -> None:
+def test_mitsuba_draws_as_the_file_says(measured, light):
     mi = pytest.importorskip("mitsuba")
     try:
         mi.set_variant("llvm_ad_rgb")
@@ -63,7 +62,7 @@ def test_mitsuba_draws_as_the_file_says(measured, light: tuple[float, float, flo
     assert passed
 
 
-def test_radiance_finds_sides_and_shares(tmp_path: Path) -> None:
+def test_radiance_finds_sides_and_shares(tmp_path):
     """What its library sums over all that leaves, from patches 10 degrees wide; its z points where the room is."""
     bsdf = pytest.importorskip("pyradiance").bsdf
     path = tmp_path / "sheet.xml"

@@ -61,11 +61,11 @@ def fitted(geometry, values):
 )
 def test_the_joint_fit_of_a_pilot_is_that_of_joint(geometry, values, prior, bounds):
     problems = {}
-    for k, row in enumerate(values):
+    for k, row in enumerate(values[:2]):
         data = Measurements(geometry.wi, geometry.wo, row, None, np.ones(len(row), bool), ("value",))
         problems[f"t{k}"] = fits.Problem(free(*bounds, prior=prior), data, transport=TRANSPORT, noise=NOISE)
     joint = fits.fit(fits.Joint(problems, shared=["layers[0].phase.g"]), starts=4)
-    common = fit_common(problems["t0"], make_texels(values, least=NOISE.floor), MapOptions(starts=4, chunk_size=4))
+    common = fit_common(problems["t0"], make_texels(values[:2], least=NOISE.floor), MapOptions(starts=4, chunk_size=4))
     ((name, value),) = common.values.items()
     assert common.converged
     assert with_common(problems["t0"], common.values).names == NAMES
@@ -115,21 +115,20 @@ COAT = lj.Stack([HAZE], lj.Lambertian(fits.Free((0.1, 0.2, 0.3), 0.0, 1.0, same_
 VALUES = {"layers[0].phase.g": 0.4, "base.albedo[0]": 0.5, "base.albedo[1]": 0.25, "base.albedo[2]": 0.125}
 
 
-def problem_of(stack, **more) -> fits.Problem:
+def problem_of(stack, **more):
     view = fits.slices(incidence=(10.0, 40.0), outgoing=(-30.0, 0.0, 20.0, 50.0))
     data = Measurements(view.wi, view.wo, np.full((8, 3), 0.1), None, np.ones(8, bool), ("red", "green", "blue"))
     noise = fits.Noise(relative=0.05, floor=1e-3)
     return fits.Problem(stack, data, **{"transport": lj.SingleScattering(), "noise": noise} | more)
 
 
-def test_a_stack_file_has_the_mark(tmp_path) -> None:
+def test_a_stack_file_has_the_mark(tmp_path):
     scale = fits.Free(1.0, 0.8, 1.25, same_for_all_texels=True)
     path = tmp_path / "coat.toml"
     write_problem(path, COAT, scale=scale)
     assert path.read_text().count("same_for_all_texels = true") == 3
     again = read_problem(path)
     assert (again.scale, again.stack.layers[0].phase.g) == (scale, HAZE.phase.g)
-    assert repr(again.scale) == "Free(1.0, 0.8, 1.25, same_for_all_texels=True)"
     path.write_text("[base]\nkind = 'Lambertian'\nalbedo = { start = 0, low = 0, high = 1, same_for_all_texels = 1 }\n")
     with pytest.raises(ValueError, match=r"base.albedo.same_for_all_texels is 1, must be true or false"):
         read_problem(path)
@@ -137,7 +136,7 @@ def test_a_stack_file_has_the_mark(tmp_path) -> None:
         fits.Free(0.5, 0.0, 1.0, same_for_all_texels="yes")  # type: ignore[arg-type]
 
 
-def test_common_parameters_are_held() -> None:
+def test_common_parameters_are_held():
     problem = problem_of(
         COAT,
         scale=fits.Free(1.0, 0.8, 1.2, same_for_all_texels=True),
@@ -153,17 +152,15 @@ def test_common_parameters_are_held() -> None:
     assert (held.scale, held.noise.floor) == (1.1, 2e-3)
 
 
-def test_mixtures_and_power_laws_have_common_parameters() -> None:
+def test_mixtures_and_power_laws_have_common_parameters():
     waves, common = (450.0, 550.0, 650.0), {"same_for_all_texels": True}
     law = PowerLaw(fits.Free(1.0, 0.1, 3.0), fits.Free(1.0, 0.5, 2.0, **common), waves)
-    other = PowerLaw(fits.Free(1.0, 0.1, 3.0, **common), fits.Free(1.0, 0.5, 2.0, **common), waves, reference=450.0)
-    bare = lj.Stack([lj.Medium(law, 0.5), lj.Medium(other, 0.5)], lj.Lambertian(0.5))
+    bare = lj.Stack([lj.Medium(law, 0.5)], lj.Lambertian(0.5))
     mixed = lj.Mixture({"bare": bare, "coat": COAT}, [fits.Free(0.3, 0.0, 1.0, **common), None])
     problem = problem_of(mixed)
-    laws = [f"bare.layers[{k}].thickness.{name}" for k, name in ((0, "exponent"), (1, "amplitude"), (1, "exponent"))]
-    assert set(problem.common_names) == {"weights.bare", *laws, *(f"coat.{name}" for name in VALUES)}
+    names = {"weights.bare", "bare.layers[0].thickness.exponent", *(f"coat.{name}" for name in VALUES)}
+    assert set(problem.common_names) == names
     held = with_common(problem, dict.fromkeys(problem.common_names, 0.5))
     left = [leaf for leaf in jax.tree.leaves(held.stack, is_leaf=is_free) if is_free(leaf)]
     assert left == [fits.Free(1.0, 0.1, 3.0), HAZE.thickness]
-    built = held.build(held.start).stack.parts["bare"].layers[1].thickness
-    np.testing.assert_allclose(built, 0.5 * (np.array(waves) / 450.0) ** -0.5, rtol=1e-12)
+    np.testing.assert_array_equal(held.stack.parts["bare"].layers[0].thickness.exponent, 0.5)

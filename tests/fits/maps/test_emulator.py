@@ -1,4 +1,4 @@
-"""Emulators in the place of a transport: their values and derivatives against the transport itself."""
+"""Emulators in the place of a transport: their values and derivatives against the transport itself, a toy of one."""
 
 import jax
 import jax.numpy as jnp
@@ -14,22 +14,30 @@ from fits.maps.emulator import chebyshev, emulate, with_emulator
 from fits.maps.options import MapOptions
 from fits.problem.model import Model
 
-TRANSPORT = lj.AddingDoubling(nodes=4, modes=4)
 ERROR = MapOptions.emulator_error
 NOISE = fits.Noise(relative=0.02, floor=1e-4, discrepancy=False)
-NAMES = ("layers[0].alpha", "base.albedo[0]", "base.albedo[1]")
-FREE = lj.Stack(
-    [lj.Interface(1.5, fits.Free(0.3, 0.1, 0.6))], lj.Lambertian(fits.Free((0.4, 0.5), 0.05, 0.95))
-)  # fmt: skip
+NAMES = ("layers[0].thickness", "base.albedo[0]", "base.albedo[1]")
+TRUTH = 0.4, 0.3, 0.6
+FREE = lj.Stack([lj.Medium(fits.Free(0.5, 0.1, 2.0), 0.8)], lj.Lambertian(fits.Free((0.4, 0.5), 0.05, 0.95)))
 
 
-@pytest.fixture(scope="module")
-def problem():
+def haze(stack, wi, wo):
+    """A base through an absorber that scatters once, evenly."""
+    passed = jnp.exp(-stack.layers[0].thickness * (1.0 / wi[:, 2] + 1.0 / wo[:, 2]))[:, None]
+    return passed * stack.base.albedo / np.pi + (1.0 - passed) * 0.1 / (wi[:, 2] + wo[:, 2])[:, None]
+
+
+def problem_of(transport):
     every = fits.slices(incidence=[10.0, 60.0])
     places = np.linspace(0, len(every.wi) - 1, 12).astype(int)
     view, values = (every.wi[places], every.wo[places]), np.full((12, 2), 0.1)
     data = Measurements(*view, values, None, np.ones(12, bool), ("one", "two"))
-    return fits.Problem(FREE, data, transport=TRANSPORT, noise=NOISE, scale=fits.Free(1.0, 0.8, 1.25))
+    return fits.Problem(FREE, data, transport=transport, noise=NOISE, scale=fits.Free(1.0, 0.8, 1.25))
+
+
+@pytest.fixture(scope="module")
+def problem():
+    return problem_of(haze)
 
 
 @pytest.fixture(scope="module")
@@ -53,10 +61,10 @@ def test_values_are_those_of_the_transport_within_a_tenth_of_the_noise(problem, 
         assert np.max(np.abs(found - exact) / sigma) < 2.0 * ERROR  # at points that no check has seen
 
 
-def test_derivatives_are_those_of_the_emulator(problem, emulated, vectors):
+def test_derivatives_are_those_of_the_emulator(emulated, vectors):
     predict = jax.jit(lambda vector: emulated.model.predict(vector))
     by_columns, by_rows = jax.jit(jax.jacfwd(predict)), jax.jit(jax.jacrev(predict))
-    for vector in (jnp.asarray(vectors[7]), jnp.asarray(problem.low), jnp.asarray(problem.high)):
+    for vector in (jnp.asarray(vectors[7]), jnp.asarray(emulated.low), jnp.asarray(emulated.high)):
         np.testing.assert_allclose(by_columns(vector), by_rows(vector), rtol=1e-9, atol=1e-12)
     inside, step = jnp.asarray(vectors[7]), 1e-5
     slopes = np.asarray(by_columns(inside))
@@ -71,10 +79,10 @@ def test_derivatives_are_those_of_the_emulator(problem, emulated, vectors):
 
 
 def test_chebyshev_polynomials_are_cosines():
+    exact = np.polynomial.chebyshev.chebder(np.eye(6))
     for x in (-1.0, -0.3, 0.0, 0.8, 1.0):
         basis, slope = chebyshev(jnp.asarray(x), 6)
         np.testing.assert_allclose(basis, np.cos(np.arange(6) * np.arccos(x)), atol=1e-12)
-        exact = np.polynomial.chebyshev.chebder(np.eye(6))
         np.testing.assert_allclose(slope, np.polynomial.chebyshev.chebval(x, exact), atol=1e-12)
 
 
@@ -84,21 +92,31 @@ def test_too_dear_an_emulator_is_not_made(problem):
     assert "of 10 allowed" in words
 
 
-def test_a_map_of_exact_transport_by_an_emulator_ends_where_it_does_without(tmp_path, problem):
-    exact = np.asarray(problem.predict(np.array([0.2, 0.3, 0.6, 1.0])))
+def fitted(out, transport, **options):
+    """A map of six texels."""
+    problem = problem_of(transport)
+    exact = np.asarray(problem.predict(np.array([*TRUTH, 1.0])))
     values = exact * (1.0 + NOISE.relative * np.random.default_rng(2).standard_normal((6, *exact.shape)))
+    view, options = Geometry(problem.data.wi, problem.data.wo), MapOptions(starts=2, chunk_size=4, **options)
+    return fits.fit_map(FREE, view, values, out, NOISE, transport=transport, options=options)
 
-    def fitted(emulator):
-        geometry = Geometry(problem.data.wi, problem.data.wo)
-        options = MapOptions(starts=2, chunk_size=4, emulator=emulator)
-        out = tmp_path / f"{emulator}.zarr"
-        return fits.fit_map(FREE, geometry, values, out, NOISE, transport=TRANSPORT, options=options)
 
-    emulated, direct = fitted(True), fitted(False)
-    assert "an emulator of" in emulated.attributes["numerical"]["emulator"]
+def test_a_map_by_an_emulator_ends_where_it_does_without(tmp_path):
+    emulated, direct = (fitted(tmp_path / f"{one}.zarr", haze, emulator=one) for one in (True, False))
     # values move by as much as the emulator's error is of the noise, a tenth at most in a measurement
-    for name in NAMES:
+    for name, truth in zip(NAMES, TRUTH, strict=True):
         assert np.all(np.abs(emulated.values[name] - direct.values[name]) < ERROR * direct.errors[name])
         np.testing.assert_allclose(emulated.errors[name], direct.errors[name], rtol=0.02)
-    assert emulated.numerical_error > 0.0
-    assert fitted(True).attributes == emulated.attributes
+        assert np.all(np.abs(direct.values[name] - truth) < 4.0 * direct.errors[name])
+
+
+@pytest.mark.slow  # an exact transport compiles for ten seconds
+def test_an_exact_transport_is_emulated_where_that_pays(tmp_path):
+    transport = lj.AddingDoubling(nodes=4, modes=4)
+    map = fitted(tmp_path / "coat.zarr", transport, emulator_min_texels=6)
+    assert "an emulator of" in map.attributes["numerical"]["emulator"]
+    assert map.numerical_error > 0.0
+    for name, truth in zip(NAMES, TRUTH, strict=True):
+        assert np.all(np.abs(map.values[name] - truth) < 4.0 * map.errors[name])
+    again = fitted(tmp_path / "coat.zarr", transport, emulator_min_texels=6)
+    assert again.attributes == map.attributes

@@ -1,7 +1,6 @@
 """Measurements of a map by blocks: every source gives the same numbers, and what is wrong is named."""
 
 import pickle
-from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -56,8 +55,6 @@ def test_each_source_gives_the_same_blocks(tmp_path):
             again = pickle.loads(small)
             np.testing.assert_array_equal(again.read(BLOCK).values, VALUES[BLOCK])
             assert again.fingerprints() == expected
-    without = replace(map_data(tmp_path / "v.npy", VIEW, sigma=SIGMA), sigma=None)
-    assert pickle.loads(pickle.dumps(without)).sigma is None
     data = map_data(VALUES, VIEW)
     data.read(BLOCK).values[...] = 0.0  # a copy
     np.testing.assert_array_equal(data.read(BLOCK).values, VALUES[BLOCK])
@@ -120,11 +117,8 @@ def test_deviations_and_masks_are_of_the_block(tmp_path, sigma):
             {"values": np.ones((N, 3))},
             r"values has shape \(6, 3\), the geometry 6 pairs .*: values must be \(..., 6, C\)",
         ),
-        ({"values": np.ones((4, 5, 7, 3))}, r"values has shape \(4, 5, 7, 3\), the geometry 6 pairs"),
         ({"values": np.ones((0, N))}, r"values has shape \(0, 6\), must hold something"),
         ({"values": np.ones((2, N), complex)}, "values holds complex128, must hold real numbers"),
-        ({"values": [["a"] * N]}, "values holds <U1, must hold real numbers"),
-        ({"values": "nowhere.npy"}, "no such file: 'nowhere.npy'"),
         ({"values": "."}, "a map is one array, in one of .npy, .*for layerjax fit and layerjax fit-many"),
         ({"values": __file__}, r"test_inputs.py: a map is one array, in one of .npy"),
         ({"sigma": SIGMA[1:]}, r"sigma has shape \(4, 4, 6, 2\), must be \(5, 4, 6, 2\) or \(5, 4, 6\) or \(6,\)"),
@@ -133,11 +127,9 @@ def test_deviations_and_masks_are_of_the_block(tmp_path, sigma):
         ({"geometry": None}, "geometry is not given, and there is nothing beside the values"),
         ({"geometry": (VIEW.wi, 2.0 * VIEW.wo)}, "geometry: wo is .* must be finite and of length 1"),
         ({"geometry": (VIEW.wi, VIEW.wo[:3])}, r"geometry/wo has shape \(3, 3\), must be \(6, 3\) or \(5, 4, 6, 3\)"),
-        ({"geometry": (VIEW.wi, VIEW.wo[:, :2])}, r"geometry/wo has shape \(6, 2\), must be \(6, 3\)"),
         ({"geometry": (VIEW.wi,)}, "geometry has 1 entries, must be two"),
         ({"geometry": {"wi": VIEW.wi}}, "geometry has no directions, must hold wi and wo, or theta_i"),
         ({"geometry": ANGLES | {"theta_o": VIEW.theta_o + 200.0}}, r"theta_o is .*, must be in \[0, 180\] degrees"),
-        ({"geometry": (VIEW.wi, np.zeros((4, 5, N, 3)))}, r"wo has shape \(4, 5, 6, 3\), must be \(6, 3\)"),
         ({"geometry": "view.npy"}, "no such file: 'view.npy'"),
     ],
 )
@@ -230,7 +222,7 @@ def test_only_blocks_are_read(tmp_path):
 # ---- directions ----
 
 
-@pytest.mark.parametrize("kind", ["zarr", "hdf5", "xarray", "xarray, by angles"])
+@pytest.mark.parametrize("kind", ["zarr", "hdf5", "xarray"])
 @pytest.mark.parametrize("each", [False, True], ids=["common", "each"])
 def test_directions_may_stand_beside_the_values(tmp_path, kind, each):
     turn = np.linspace(0.0, 30.0, SHAPE[0] * SHAPE[1]).reshape(*SHAPE, 1) if each else 0.0
@@ -243,16 +235,11 @@ def test_directions_may_stand_beside_the_values(tmp_path, kind, each):
         arrays = {"scan/values": VALUES} | {f"scan/{name}": array for name, array in angles.items()}
         data = map_data(f"{hdf5_file(tmp_path / 'v.h5', arrays)}:/scan/values")
     else:
-        dims = DIMS[:3]
-        named = {name: (dims[-np.ndim(array) :], array) for name, array in angles.items()}
-        if kind == "xarray":
-            vectors = {"wi": (("sample", "xyz"), wi), "wo": ((*dims[-wo.ndim + 1 :], "xyz"), wo)}
-            data = map_data(xarray.Dataset(vectors | {"values": (DIMS, VALUES)}).transpose())
-        else:
-            data = map_data(xarray.DataArray(VALUES, dims=DIMS, coords=named).transpose("x", ...))
+        named = {name: (DIMS[3 - np.ndim(array) : 3], array) for name, array in angles.items()}
+        data = map_data(xarray.DataArray(VALUES, dims=DIMS, coords=named).transpose("x", ...))
         wo = np.swapaxes(wo, 0, 1) if each else wo
     assert (data.geometry is None) == each
-    if data.geometry is not None:
+    if not each:
         np.testing.assert_allclose((data.geometry.wi, data.geometry.wo), (wi, wo), atol=1e-12)
         return
     block = (slice(1, 3), slice(0, 2))

@@ -20,6 +20,8 @@ from tests.helpers.commands import refused
 from tests.helpers.painted_maps import ATTRIBUTES, FREEDOM, GOOD, NAMES, bounded, numbers, stored, without
 
 SHAPE, CHUNK = (20, 30), (10, 10)
+PLACES = np.arange(600).reshape(SHAPE)
+RATIO = numbers(SHAPE)["reduced_chi_square"]
 FULL = 9
 """Pictures of a map of three parameters: two of each, flags, two of chi-square."""
 
@@ -59,27 +61,27 @@ def test_counts_quartiles_and_the_verdict_are_those_of_the_arrays(map, painted):
         each = painted[path][fitted]
         assert numbers.quartiles[path] == pytest.approx(np.percentile(each[np.isfinite(each)], (25, 50, 75)))
     rows = {row[0]: row[1:] for row in summary.count_table(numbers).rows}
-    assert rows["of the map"] == ("600", "")
     assert rows["converged"] == ("537", "99.26 % of the fitted")
     assert rows["masked"] == ("29", "4.83 %")
     assert rows["at a bound: layers[0].phase.alpha"] == ("25", "4.62 % of the fitted")
-    quartiles = summary.quartile_table(numbers, map)
-    middle = {row[0]: row for row in quartiles.rows}
+    middle = {row[0]: row for row in summary.quartile_table(numbers, map).rows}
     assert float(middle["base.albedo"][2]) == pytest.approx(np.median(painted["values/base.albedo"][fitted]), rel=1e-3)
-    assert middle["layers[0].thickness"][7] == "optical depth"
     root = ET.fromstring(f"<div>{map._repr_html_()}</div>")  # of a notebook
     shown = {row[0].text: [cell.text for cell in row] for row in root.iter("tr")}
     assert tuple(shown["base.albedo"]) == middle["base.albedo"]
-    assert "A map of 600 texels" in "".join(root.itertext())
 
-    words, sound = verdict(numbers, map)
+    sentences, sound = verdict(numbers, map)
     assert not sound  # 10 of 551 failed
-    assert words[0] == "A map of 600 texels: 541 are fitted, 29 masked, 20 with too few measurements, 10 failed."
-    assert words[1] == "99.26 % of the fitted texels converged."
-    assert f"1 ± {np.sqrt(2 / FREEDOM):.2g}" in words[2]
-    assert "At a bound: 4.62 % of the fitted texels (layers[0].phase.alpha in 4.62 %)." in words
-    assert "Poor: 2.21 % of the fitted texels: chi-square is above 1.6, more than noise" in " ".join(words)
-    assert words[-1] == "The numerical error of the model is at most 0.025 standard deviations in the pilot."
+    words = " ".join(sentences)
+    for sentence in (
+        "A map of 600 texels: 541 are fitted, 29 masked, 20 with too few measurements, 10 failed.",
+        "99.26 % of the fitted texels converged.",
+        f"1 ± {np.sqrt(2 / FREEDOM):.2g}",
+        "At a bound: 4.62 % of the fitted texels (layers[0].phase.alpha in 4.62 %).",
+        "Poor: 2.21 % of the fitted texels: chi-square is above 1.6, more than noise",
+        "The numerical error of the model is at most 0.025 standard deviations in the pilot.",
+    ):
+        assert sentence in words
 
 
 def changed(**arrays):
@@ -90,30 +92,22 @@ def changed(**arrays):
     return made
 
 
-def scaled(factor):
-    return changed(reduced_chi_square=factor * numbers(SHAPE)["reduced_chi_square"])
+def flagged(texels, flag, ratio=RATIO):
+    """So many texels with this flag and this chi-square."""
+    return changed(
+        flags=np.where(texels > PLACES, flag, GOOD), reduced_chi_square=np.where(texels > PLACES, ratio, RATIO)
+    )
 
 
-def few(ratio, flags=GOOD):
-    """A sixth of the texels with this chi-square and these flags."""
-    some = np.arange(600).reshape(SHAPE) < 100
-    ratios = np.where(some, ratio, numbers(SHAPE)["reduced_chi_square"])
-    return changed(reduced_chi_square=ratios, flags=np.where(some, flags, GOOD))
-
-
-def unidentified(texels):
-    return changed(flags=np.where(np.arange(600).reshape(SHAPE) < texels, GOOD | FLAGS["unidentified"], GOOD))
-
-
-UNFINISHED = (
-    "The map is not finished: 200 of 600 texels (33.33 %) are done, and the same command resumes it. Of these, "
-)
+SCALED = {factor: changed(reduced_chi_square=factor * RATIO) for factor in (0.3, 1.7, 1e8)}
+LARGE = ATTRIBUTES["pilot"] | {"poor_above": 1.5e8}
 ONE = {NAMES[0]: {"value": 0.5, "error": 0.1, "unit": "1", "converged": True}}
 OFF = {
     "layers[0].ior": {"value": 1.5, "error": 0.1, "unit": "1", "converged": False},
     "layers[0].thickness_mm": {"value": 2.0, "error": np.inf, "unit": "mm", "converged": False},
 }
-LEAVE = "of the fitted texels the data leave a parameter unidentified"
+LEAVE = GOOD | FLAGS["unidentified"]
+STANDS_OUT = "No texel stands out: chi-square is nowhere above "
 
 
 @pytest.mark.parametrize(
@@ -121,24 +115,24 @@ LEAVE = "of the fitted texels the data leave a parameter unidentified"
     [
         (numbers(SHAPE), {}, True, ["No texel is at a bound. No texel is poor", "100 % of the fitted texels converge"]),
         # sqrt(2 / 61) is 0.18: 1.7 and 0.3 are four of them away
-        (scaled(1.7), {}, False, ["does not explain the data to within their noise", "No texel stands out"]),
-        (scaled(0.3), {}, False, ["scatter less than the stated noise", "No texel is poor"]),
-        (
-            scaled(0.3),
-            {"noise_assumed": True},
-            False,
-            ["No noise is stated: 5 %", "less than the assumed noise"],
-        ),
-        (scaled(1.7), {"options": {"chi_square_sigmas": 5.0}}, True, ["No texel is poor"]),
-        (unidentified(30), {}, True, [LEAVE]),
-        (unidentified(31), {}, False, [LEAVE]),
-        (unidentified(31), {"options": {"flagged_share": 0.1}}, True, []),
+        (SCALED[1.7], {}, False, ["does not explain the data to within their noise", "No texel stands out"]),
+        (SCALED[0.3], {}, False, ["scatter less than the stated noise", "No texel is poor"]),
+        (SCALED[0.3], {"noise_assumed": True}, False, ["No noise is stated: 5 %", "less than the assumed noise"]),
+        (SCALED[1.7], {"options": {"chi_square_sigmas": 5.0}}, True, ["No texel is poor"]),
+        # where nothing explains the chi-squares, no texel is said to be good
+        (SCALED[1e8], {"pilot": LARGE}, False, [f"{STANDS_OUT}1.5e+08, more than in the pilot."]),
+        (flagged(100, GOOD, 1e8), {"pilot": LARGE}, False, [f"{STANDS_OUT}1.5e+08, more than in the pilot."]),
+        (flagged(100, GOOD | FLAGS["poor"], 1e8), {}, False, ["Poor: 16.66 % of the fitted texels"]),
+        (flagged(100, FLAGS["fitted"], 1e8), {}, False, ["No converged texel is poor"]),
+        (changed(reduced_chi_square=np.nan), {}, False, ["No texel has a chi-square: there are no more measurements"]),
+        (flagged(30, LEAVE), {}, True, ["of the fitted texels the data leave a parameter unidentified"]),
+        (flagged(31, LEAVE), {}, False, ["of the fitted texels the data leave a parameter unidentified"]),
+        (flagged(31, LEAVE), {"options": {"flagged_share": 0.1}}, True, []),
         (numbers(SHAPE), {"common": OFF}, False, ["joint fit of common parameters has not converged", "mm, common"]),
         (numbers(SHAPE), {"numerical": {"error": 0.2}}, False, ["0.2 standard deviations in the pilot: a finer"]),
-        (numbers(SHAPE), {"chunks": 2}, False, [UNFINISHED]),
+        (numbers(SHAPE), {"chunks": 2}, False, ["The map is not finished: 200 of 600 texels (33.33 %) are done"]),
         # of 12 measurements two are fitted away
         (changed(measurements=12, reduced_chi_square=1.0), {"common": ONE}, True, [f"1 ± {np.sqrt(2 / 10):.2g}"]),
-        (changed(measurements=3, reduced_chi_square=np.nan), {}, False, ["no more measurements than parameters"]),
     ],
 )
 def test_the_verdict_is_a_matter_of_its_thresholds(arrays, more, sound, sentences, tmp_path):
@@ -147,6 +141,10 @@ def test_the_verdict_is_a_matter_of_its_thresholds(arrays, more, sound, sentence
     assert is_sound == sound
     for sentence in sentences:
         assert sentence in " ".join(words)
+    if np.nanmax(arrays["reduced_chi_square"], initial=0.0) > 1e6:
+        assert "No texel is poor" not in " ".join(words)
+    if "chunks" in more:
+        assert ("done so far", "200", "33.33 %") in summary.count_table(summarise(map)).rows
     if more.get("common") is OFF:
         rows = (("layers[0].ior", "1.50", "0.10", "1"), ("layers[0].thickness_mm", "2", "unknown", "mm"))
         assert summary.common_table(map).rows == rows
@@ -161,7 +159,6 @@ def test_nearly_all_is_not_written_as_all_and_the_worst_texels_come_first(map, p
     value, error = (painted[f"{group}/base.albedo"][10, 29] for group in ("values", "errors"))
     written, _, after = table.rows[0][4].partition(" ± ")
     assert (float(written), float(after)) == (pytest.approx(value, abs=0.06 * error), pytest.approx(error, rel=0.05))
-    assert {row[-1] for row in table.rows} == {"poor"}
     arrays = numbers((2, 2))
     arrays["reduced_chi_square"][...] = [[4.0, 3.0], [2.0, np.nan]]
     arrays["flags"][0, 0] = FLAGS["fitted"] | FLAGS["poor"] | FLAGS["unidentified"]
@@ -172,57 +169,28 @@ def test_nearly_all_is_not_written_as_all_and_the_worst_texels_come_first(map, p
     assert "±" not in table.rows[1][4]
 
 
-POOR_PILOT = {"pilot": ATTRIBUTES["pilot"] | {"poor_above": 1.5e8}}
-
-
-@pytest.mark.parametrize(
-    ("arrays", "more", "sentence"),
-    [
-        (scaled(1e8), {}, "No texel stands out: chi-square is nowhere above 1.6, more than in the pilot."),
-        (scaled(1e8), POOR_PILOT, "No texel stands out: chi-square is nowhere above 1.5e+08, more than in the pilot."),
-        (few(1e8), POOR_PILOT, "No texel stands out: chi-square is nowhere above 1.5e+08, more than in the pilot."),
-        (few(1e8, GOOD | FLAGS["poor"]), {}, "Poor: 16.66 % of the fitted texels"),
-        (few(1e8, FLAGS["fitted"]), {}, "No converged texel is poor"),
-        (changed(reduced_chi_square=np.nan), {}, "No texel has a chi-square"),
-    ],
-)
-def test_no_texel_is_poor_does_not_stand_beside_a_chi_square_that_nothing_explains(arrays, more, sentence, tmp_path):
-    map = stored(tmp_path / "a.zarr", arrays, CHUNK, **more)
-    words, sound = verdict(summarise(map), map)
-    assert sentence in " ".join(words)
-    assert "No texel is poor" not in " ".join(words)
-    assert not sound
-
-
 # ---- the page ----
+
+
+SMOOTHING = {"prior": {"kind": "gaussian", "scale": dict.fromkeys(NAMES, 0.05)}, "rounds": 3, "settled": False}
+ROUNDS = "(gaussian, of the bounds: 0.05), in 3 rounds; "
 
 
 @pytest.mark.parametrize(
     ("state", "count", "words"),
     [
-        ("whole", FULL, ["A map of 600 texels: 541 are fitted, 29 masked", 'class="verdict"', "The worst texels"]),
-        ("unfinished", FULL, ["done so far</td>"]),
+        ("whole", FULL, ["A map of 600 texels: 541 are fitted, 29 masked", "The worst texels"]),
         ("empty", 1, ["No texel is fitted."]),
-        ("one texel", FULL, ["A map of 1 texels"]),
-        ("three axes", FULL, ["Slice [2] of 5."]),
-        (
-            "smoothed",
-            FULL + 6,
-            ["(gaussian, of the bounds: 0.05), in 3 rounds; ", "at most 0.5 ", ": it has not settled"],
-        ),
+        ("smoothed", FULL + 6, [ROUNDS, "at most 0.5 ", ": it has not settled", "Slice [2] of 5."]),
     ],
 )
 def test_maps_in_every_state_are_reported_as_one_whole_file(state, count, words, painted, tmp_path):
-    shape = {"one texel": (1, 1), "three axes": (5, 8, 9), "smoothed": (4, 4)}.get(state, SHAPE)
-    arrays, chunks = painted if shape == SHAPE else numbers(shape), {"unfinished": 2, "empty": 0}.get(state)
-    chunk = CHUNK if len(shape) == 2 else shape
-    map = stored(tmp_path / "<coat> & co.zarr", arrays, chunk, chunks=chunks)
+    arrays, chunk = (numbers((5, 4, 4)), (5, 4, 4)) if state == "smoothed" else (painted, CHUNK)
+    map = stored(tmp_path / "<coat> & co.zarr", arrays, chunk, chunks=0 if state == "empty" else None)
     if state == "smoothed":
         groups = {f"{group}/{name}": map[f"{group}/{name}"][:] for group in ("values", "errors") for name in NAMES}
-        about = {"prior": {"kind": "gaussian", "scale": dict.fromkeys(NAMES, 0.05)}, "rounds": 3, "settled": False}
-        Store(map.path).save_group(
-            "smoothed", groups, {"smoothing": about | {"largest_moves": [3.0, 0.5]}, "finished": True}
-        )
+        about = {"smoothing": SMOOTHING | {"largest_moves": [3.0, 0.5]}, "finished": True}
+        Store(map.path).save_group("smoothed", groups, about)
     fits.report(map, path=tmp_path / "report.html")
     text = (tmp_path / "report.html").read_text()
     captions = re.findall(r'<img alt="([^"]*)" src="data:image/png;base64,[^"]{1000,}">', text)
@@ -237,7 +205,7 @@ def test_maps_in_every_state_are_reported_as_one_whole_file(state, count, words,
     text = re.sub(r"base64,[^\"]*", "", text)
     assert "http" not in text
     assert "<coat>" not in text
-    made = ("Noise(relative=0.02)", "&quot;poor_above&quot;: 1.6", "kind = &quot;Medium&quot;", "Made with layerjax")
+    made = ("Noise(relative=0.02)", "&quot;poor_above&quot;: 1.6", "kind = &quot;Medium&quot;")
     common = 'layers[0].f0</td><td class="number">0.04321</td><td class="number">0.00012'
     for one in ("Map of &lt;coat&gt; &amp; co.zarr", *made, *([common] if count > 1 else []), *words):
         assert one in text, one
@@ -281,12 +249,10 @@ def test_an_image_is_the_map_with_row_0_on_top_in_colours_over_the_middle():
     np.testing.assert_array_equal(shown, np.where(np.isfinite(values), values, np.nan))
     assert figure.axes[0].get_ylim() == (2.5, -0.5)
     assert figure.axes[1].get_ylabel() == "mm"
-    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["no value"]
     norm = page.inner_norm(np.concatenate([np.linspace(1.0, 2.0, 999), [1e9, np.nan, np.inf]]))
     assert (norm.vmin, norm.vmax) == (pytest.approx(1.0, abs=0.02), pytest.approx(2.0, abs=0.02))
     assert isinstance(page.inner_norm(np.geomspace(1e-3, 1.0, 100)), LogNorm)
-    assert not isinstance(norm, LogNorm)
-    for each in ([], [np.nan], [0.0, 0.0], [3.0], [-2.0, -2.0]):
+    for each in ([], [np.nan], [0.0, 0.0], [-2.0, -2.0]):
         norm = page.inner_norm(np.array(each))
         assert norm.vmin < norm.vmax
     norm = page.ratio_norm(np.append(np.geomspace(0.5, 20.0, 99), 0.0))
@@ -301,7 +267,6 @@ def test_a_texel_is_shown_as_the_gravest_of_its_flags_and_chi_square_beside_what
     flags += [GOOD | FLAGS["restarted"], GOOD]
     figure = page.flag_picture(np.array(flags, np.uint16))
     np.testing.assert_array_equal(figure.axes[0].images[0].get_array(), [np.arange(10)])
-    assert [text.get_text() for text in figure.legends[0].get_texts()] == [f"{words}: 1" for words, *_ in page.STATES]
     ratio = np.random.default_rng(0).chisquare(40, 20_000) / 40
     at, expected = page.chi_square_histogram(ratio, np.full(ratio.size, 40)).axes[0].lines[0].get_data()
     np.testing.assert_allclose(expected, 40 * stats.chi2.pdf(40 * np.asarray(at), 40), rtol=1e-10)

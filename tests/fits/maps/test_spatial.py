@@ -12,10 +12,9 @@ import fits
 import layerjax as lj
 from fits.maps import spatial
 from fits.maps.inputs import MapData
-from fits.maps.options import MapOptions
 from fits.maps.spatial import neighbour_prior
 from tests.helpers import quick_maps
-from tests.helpers.quick_maps import NAMES, TRANSPORT, assert_same, coat, full_disk
+from tests.helpers.quick_maps import NAMES, TRANSPORT, assert_same, coat
 
 SHAPE, CHUNK = (4, 4), 12  # the second chunk begins at an odd column
 THICKNESS, ALBEDO = NAMES
@@ -159,7 +158,6 @@ def test_the_plain_fit_stays_and_masked_texels_stay_out(plain, gaussian):
     for name in NAMES:
         for numbers in (gaussian.smoothed[name], gaussian.smoothed_errors[name]):
             np.testing.assert_array_equal(np.isfinite(numbers), MASK)
-        np.testing.assert_array_equal(gaussian[f"smoothed/values/{name}"][:], gaussian.smoothed[name])
 
 
 def test_parameters_that_are_not_named_are_not_smoothed(out, fitted):
@@ -170,13 +168,12 @@ def test_parameters_that_are_not_named_are_not_smoothed(out, fitted):
     assert rough[ALBEDO] < 0.5 < rough[THICKNESS]
 
 
-@pytest.mark.parametrize("how", ["stopped", "full disk"])
-def test_a_run_that_was_stopped_is_resumed_to_the_bit(out, monkeypatch, fitted, gaussian, how):
+def test_a_run_that_was_stopped_is_resumed_to_the_bit(out, fitted, gaussian):
     def stop(stage, done, total=None, info=""):
-        if stage == "smoothing" and done == 2 and how == "stopped":
+        if stage == "smoothing" and done == 2:
             raise KeyboardInterrupt
 
-    with full_disk(monkeypatch, 80 if how == "full disk" else None), pytest.raises((KeyboardInterrupt, OSError)):
+    with pytest.raises(KeyboardInterrupt):
         fitted(out, spatial_prior=GAUSSIAN, progress=stop)
     assert fits.open_map(out).done == 1.0
     assert fits.open_map(out).smoothed is None
@@ -216,10 +213,8 @@ def test_another_prior_smooths_anew_and_fits_nothing_again(tmp_path, smoothed, f
         ({"objective": "cosine_l2", "stack": quick_maps.FREE}, "objective 'cosine_l2' has no noise"),
         ({"kind": "laplace"}, "SpatialPrior.kind: 'laplace' is not one of 'gaussian', 'total_variation'"),
         ({"scale": 0.0}, "SpatialPrior.scale is 0.0; it must be a number from 1e-06 to 1e"),
-        ({"scale": "wide"}, "SpatialPrior.scale is 'wide'"),
         ({"scale": {"base.albedo": -1.0}}, r"SpatialPrior.scale\['base.albedo'\] is -1.0"),
         ({"scale": {}}, "SpatialPrior.scale is empty"),
-        ({"rounds": 1.5}, "SpatialPrior.rounds: 1.5 is not a whole number of at least 1"),
     ],
 )
 def test_invalid_spatial_priors_are_refused(tmp_path, measured, options, words):
@@ -228,8 +223,6 @@ def test_invalid_spatial_priors_are_refused(tmp_path, measured, options, words):
     with pytest.raises(ValueError, match=words):
         quick_maps.fitted(tmp_path / "no.zarr", measured[0], **more, spatial_prior=fits.SpatialPrior(**prior))
     assert not (tmp_path / "no.zarr").exists()
-    with pytest.raises(ValueError, match="spatial_prior"):
-        MapOptions(spatial_prior=0.1)  # type: ignore[arg-type]
 
 
 # ---- the prior by itself: against loops over all pairs of texels ----

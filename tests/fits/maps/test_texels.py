@@ -37,11 +37,7 @@ def problem_of(geometry, noise, values=None, objective="likelihood"):
     return Problem(FREE, data, transport=TRANSPORT, noise=noise, objective=objective)
 
 
-@pytest.mark.parametrize(
-    ("noise", "objective"),
-    [(FIXED, "likelihood"), (LEVELS, "likelihood"), (FIXED, "cube_root")],
-    ids=["fixed", "free", "named"],
-)
+@pytest.mark.parametrize(("noise", "objective"), [(LEVELS, "likelihood"), (FIXED, "cube_root")], ids=["free", "named"])
 def test_each_ends_where_a_descent_of_its_own_does(geometry, noisy, noise, objective):
     """However the descent is cut short, from starts far away and near.
 
@@ -71,18 +67,20 @@ def test_each_ends_where_a_descent_of_its_own_does(geometry, noisy, noise, objec
     np.testing.assert_allclose(again.cost, found.cost, rtol=1e-9, atol=1e-7)
 
 
-@pytest.mark.parametrize("count", [1, 70])
-def test_what_is_known_at_starts_is_what_the_model_says(geometry, count):
+def test_what_is_known_at_starts_is_what_the_model_says(geometry):
     """Values and derivatives of few points, and of more than a program takes at once."""
-    problem, units = problem_of(geometry, LEVELS), np.random.default_rng(count).random((count, 3))
-    known = linearise_at(problem, units, SIZE)
-    assert known.values.shape == (count, 16, 1)
-    for place in (0, count - 1):
-        vector = problem.model.box.from_unit(jnp.asarray(units[place]))
-        np.testing.assert_allclose(known.values[place], problem.model.predict(vector), rtol=1e-12)
-        slopes = np.moveaxis(np.asarray(jax.jacrev(problem.model.predict)(vector)), -1, 0)
-        np.testing.assert_allclose(known.slopes[place], slopes, rtol=1e-9, atol=1e-12)
-        np.testing.assert_allclose(to_units(problem, np.asarray(vector)), units[place], rtol=1e-12)
+    problem = problem_of(geometry, LEVELS)
+    slopes_at = jax.jit(jax.jacrev(problem.model.predict))
+    for count in (1, 70):
+        units = np.random.default_rng(count).random((count, 3))
+        known = linearise_at(problem, units, SIZE)
+        assert known.values.shape == (count, 16, 1)
+        for place in (0, count - 1):
+            vector = problem.model.box.from_unit(jnp.asarray(units[place]))
+            np.testing.assert_allclose(known.values[place], problem.predict(vector), rtol=1e-12)
+            slopes = np.moveaxis(np.asarray(slopes_at(vector)), -1, 0)
+            np.testing.assert_allclose(known.slopes[place], slopes, rtol=1e-9, atol=1e-12)
+            np.testing.assert_allclose(to_units(problem, np.asarray(vector)), units[place], rtol=1e-12)
 
 
 def test_the_model_stands_in_the_program_once(geometry, noisy, monkeypatch):
@@ -100,14 +98,11 @@ def test_the_model_stands_in_the_program_once(geometry, noisy, monkeypatch):
 @pytest.mark.parametrize("each", [False, True], ids=["common directions", "own directions"])
 def test_any_number_of_texels_is_searched_by_the_same_programs(geometry, noisy, each):
     problem = problem_of(geometry, FIXED)
-    plain = fit_texels(problem, np.full((TEXELS, 2), 0.5), make_texels(noisy, least=1e-4), SIZE)
     problem = with_own_directions(problem) if each else problem
     sides = [np.broadcast_to(part, (TEXELS, *part.shape)) for part in (geometry.wi, geometry.wo)] if each else []
     rows, vectors = make_texels(noisy, None, 1e-4, *sides), np.array([[0.3, 0.3], [0.5, 0.5], [1.5, 0.7]])
     starts = starts_at(problem, vectors, each, SIZE)
     whole = search(problem, starts, rows, SIZE, DEFAULT)
-    found = fit_texels(problem, np.full((TEXELS, 2), 0.5), rows, SIZE)
-    np.testing.assert_allclose(found.cost, plain.cost, rtol=1e-9, atol=1e-6)
     before = _program(True)._cache_size()
     for count in (1, 6, SIZE, SIZE + 1):
         some = search(problem, starts, rows.rows(np.arange(count)), SIZE, DEFAULT)

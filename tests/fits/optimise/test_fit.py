@@ -1,8 +1,5 @@
 """Fits against scipy's and against answers known in closed form."""
 
-import subprocess
-import sys
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -26,15 +23,17 @@ from fits.reports import verdicts
 from tests.helpers.models import LINE, LOBE, LOBE_STACK, design, line, line_data, lobe, measured, noisy_lobe
 
 COUNT = 300
+DESIGN = design(COUNT)
+A, B = "['a']", "['b']"
 
 
-def noisy_line(a: float, b: float, sigma: float = 0.05, seed: int = 0):
-    noise = np.random.default_rng(seed).standard_normal((COUNT, 1))
-    return measured((design(COUNT) @ [a, b])[:, None] + sigma * noise, sigma)
+def noisy_line(a=1.0, b=0.5, sigma=0.05):
+    noise = np.random.default_rng(0).standard_normal((COUNT, 1))
+    return measured((DESIGN @ [a, b])[:, None] + sigma * noise, sigma)
 
 
-def named(result) -> dict[str, float]:
-    return {name.strip("[']"): value for name, value in result.values.items()}
+def regression(data, columns=DESIGN):
+    return np.linalg.lstsq(columns, data.values[:, 0], rcond=None)[0]
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +41,7 @@ def lobe_fit():
     return fit(LOBE_STACK, noisy_lobe(0), transport=lobe, starts=16)
 
 
-def test_the_lobe_fit_is_scipys(lobe_fit) -> None:
+def test_the_lobe_fit_is_scipys(lobe_fit):
     """Same minimum and same J'J as scipy's finite-difference solver: to 1e-3 of the errors, and 1e-3 in them."""
     data, names = noisy_lobe(0), [name.strip("[']") for name in lobe_fit.problem.names]
 
@@ -67,31 +66,39 @@ def test_the_lobe_fit_is_scipys(lobe_fit) -> None:
     assert 4 <= counts[0] <= sum(counts) <= 16
     assert f"{counts[0]} of 16 starts" in lobe_fit.status
     assert lobe_fit.minima[0].values == pytest.approx(lobe_fit.values)
-    # and the other solver finds the same minimum
-    other = fit(LOBE_STACK, data, transport=lobe, starts=2, solver="bounded")
-    assert np.all(np.abs(other.vector - lobe_fit.vector) < 0.02 * lobe_fit.errors)
-
-
-def test_new_data_do_not_recompile(lobe_fit) -> None:
+    # and new data do not recompile
     before = _program(True)._cache_size()
-    other = fit(LOBE_STACK, noisy_lobe(1), transport=lobe, starts=16, seed=3)
+    other = fit(LOBE_STACK, noisy_lobe(1), transport=lobe, starts=2, seed=3)
     assert _program(True)._cache_size() == before
     assert other.values != lobe_fit.values
 
 
-def test_repeats_scatter_as_their_errors_say() -> None:
-    """Pulls of 100 repeats have mean 0 and deviation 1, within 4 standard errors of those: 0.4 and 0.28."""
+def test_repeats_scatter_as_their_errors_say():
+    """Pulls of 64 repeats have mean 0 and deviation 1, within 4 standard errors of those: 0.5 and 0.35."""
     problem = Problem(LOBE_STACK, noisy_lobe(0), lobe)
-    values = np.stack([noisy_lobe(seed).values for seed in range(100)])
+    values = np.stack([noisy_lobe(seed).values for seed in range(64)])
     repeats = fit_many(problem, values, starts=4)
     truth = np.array([LOBE[name.strip("[']")] for name in problem.names])
     pulls = (repeats.vectors - truth) / repeats.standard_errors
     assert repeats.converged.all()
-    assert np.all(np.abs(pulls.mean(axis=0)) < 0.4)
-    assert np.all(np.abs(pulls.std(axis=0) - 1.0) < 0.29)
+    assert np.all(np.abs(pulls.mean(axis=0)) < 0.5)
+    assert np.all(np.abs(pulls.std(axis=0) - 1.0) < 0.35)
 
 
-def test_starts_are_seeded_and_fill_the_box() -> None:
+def test_the_gradient_of_the_posterior_agrees_with_differences():
+    def value_and_gradient(model, u):
+        return jax.value_and_grad(model.log_posterior_unconstrained)(u)
+
+    problem = Problem(LOBE_STACK, noisy_lobe(0), lobe)
+    u = np.linspace(-1.0, 1.0, 6)
+    # the error of central differences is about h^2 = 1e-8 relative, their rounding 1e-16 / h of the log-posterior
+    gradient, h = problem.call(value_and_gradient, u)[1], 1e-4
+    for index, step in enumerate(np.eye(6) * h):
+        up, down = (float(problem.call(value_and_gradient, u + sign * step)[0]) for sign in (1.0, -1.0))
+        np.testing.assert_allclose(gradient[index], (up - down) / (2.0 * h), rtol=1e-6)
+
+
+def test_starts_are_seeded_and_fill_the_box():
     problem = Problem(LOBE_STACK, noisy_lobe(0), lobe)
     points = start_points(problem, 33, 5)
     np.testing.assert_array_equal(points, start_points(problem, 33, 5))
@@ -100,209 +107,202 @@ def test_starts_are_seeded_and_fill_the_box() -> None:
     assert not np.array_equal(points[1:], start_points(problem, 33, 6)[1:])
 
 
-@pytest.mark.parametrize("solver", ["least_squares", "bounded"])
-def test_a_parameter_beyond_its_bound_is_held_there(solver: str) -> None:
+def test_a_parameter_beyond_its_bound_is_held_there_and_one_near_it_is_not():
     """a is best at 1.5 but may not exceed 1: b is then the one-parameter regression, with its error."""
     data = noisy_line(1.5, 0.5)
-    result = fit({"a": Free(0.5, 0.0, 1.0), "b": Free(0.1, -1.0, 3.0)}, data, transport=line, starts=4, solver=solver)
-    x = design(COUNT)[:, 1]
-    assert result.at_bound == ("['a']",)
-    assert named(result)["a"] == 1.0
-    assert named(result)["b"] == pytest.approx(x @ (data.values[:, 0] - 1.0) / (x @ x), rel=1e-6)
-    assert result.standard_errors["['b']"] == pytest.approx(0.05 / np.sqrt(x @ x), rel=1e-6)
-    assert np.isnan(result.standard_errors["['a']"])
+    result = fit({"a": Free(0.5, 0.0, 1.0), "b": LINE["b"]}, data, transport=line, starts=4)
+    x = DESIGN[:, 1]
+    assert result.at_bound == (A,)
+    assert result.values[A] == 1.0
+    assert result.values[B] == pytest.approx(x @ (data.values[:, 0] - 1.0) / (x @ x), rel=1e-6)
+    assert result.standard_errors[B] == pytest.approx(0.05 / np.sqrt(x @ x), rel=1e-6)
+    assert np.isnan(result.standard_errors[A])
     assert "at a bound: ['a']" in result.status
+    # an optimum 1e-4 of the box inside is an interior minimum
+    optimum = regression(noisy_line())
+    near = fit({"a": Free(0.5, -1.0, optimum[0] + 2e-4), "b": LINE["b"]}, noisy_line(), transport=line, starts=4)
+    assert near.at_bound == ()
+    np.testing.assert_allclose(near.vector, optimum, atol=1e-6)
 
 
-def test_a_value_near_its_bound_is_not_at_it() -> None:
-    """The optimum lies 1e-4 of the box inside: an interior minimum, with its ordinary error."""
-    data = noisy_line(1.0, 0.5)
-    free = np.linalg.lstsq(design(COUNT), data.values[:, 0], rcond=None)[0]
-    result = fit({"a": Free(0.5, -1.0, free[0] + 2e-4), "b": Free(0.1, -1.0, 3.0)}, data, transport=line, starts=4)
-    assert result.at_bound == ()
-    np.testing.assert_allclose(result.vector, free, atol=1e-6)
+# ---- what the data do not say ----
 
 
-def test_a_product_leaves_its_direction_open() -> None:
+def test_a_product_leaves_its_direction_open():
     """Only a times b matters: log a minus log b is open, their sum is known, and no error comes out small."""
 
     def product(stack, wi, wo):
         return (stack["a"] * stack["b"] * wo[:, 2])[:, None]
 
-    data = measured(design(COUNT)[:, 1:] * 0.25, 0.01)
+    data = measured(DESIGN[:, 1:] * 0.25, 0.01)
     stack = {"a": Free(0.5, 0.1, 1.0, LogUniform()), "b": Free(0.5, 0.1, 1.0, LogUniform())}
     result = fit(stack, data, transport=product, starts=4)
     (combination,) = result.unidentified
     assert combination.unconstrained
     assert combination.error > 1e3
     weights = combination.weights
-    assert weights["['a']"] == pytest.approx(-weights["['b']"], rel=1e-4)
-    assert abs(weights["['a']"]) == pytest.approx(np.sqrt(0.5), rel=1e-4)
+    assert weights[A] == pytest.approx(-weights[B], rel=1e-4)
+    assert abs(weights[A]) == pytest.approx(np.sqrt(0.5), rel=1e-4)
     assert result.condition_number > 1e6
     assert all(error > 0.5 for error in result.standard_errors.values())
-    assert named(result)["a"] * named(result)["b"] == pytest.approx(0.25, rel=1e-6)
+    assert result.values[A] * result.values[B] == pytest.approx(0.25, rel=1e-6)
 
 
-def test_a_prior_closes_an_open_direction() -> None:
+def test_a_prior_closes_an_open_direction():
     def total(stack, wi, wo):
         return (stack["a"] + stack["b"] + 0 * wo[:, 2])[:, None]
 
     stack = {"a": Free(0.1, -2.0, 2.0, Normal(0.3, 0.2)), "b": Free(0.1, -2.0, 2.0)}
     result = fit(stack, measured(np.full((COUNT, 1), 1.0), 0.01), transport=total, starts=4)
-    assert result.standard_errors["['a']"] == pytest.approx(0.2, rel=1e-6)
+    assert result.standard_errors[A] == pytest.approx(0.2, rel=1e-6)
     left = np.sqrt(2.0 * COST_TOLERANCE) * 0.2  # a step that promises less ends the fit
-    assert named(result) == pytest.approx({"a": 0.3, "b": 0.7}, abs=left)
+    assert result.values == pytest.approx({A: 0.3, B: 0.7}, abs=left)
     (combination,) = result.unidentified  # it is the prior that decides, and the data are said not to
     assert combination.unconstrained
 
 
-def test_a_parameter_without_effect_is_not_determined() -> None:
-    result = fit({**LINE, "c": Free(0.5, 0.0, 1.0)}, noisy_line(1.0, 0.5), transport=line, starts=2)
-    assert result.standard_errors["['c']"] == np.inf
-    assert result.condition_number == np.inf
-    assert np.isfinite(result.standard_errors["['a']"])
-    assert result.unidentified == (Direction(np.inf, {"['c']": 1.0}, {"['c']": np.inf}),)
-    assert result.insensitive == ("['c']",)
-    assert result.at_bound == ()
-    assert "1 direction(s) in the space of parameters are not identified" in result.status
-    assert verdicts.identifiability(result)["['c']"] == "insensitive: no effect on the data"
-
-
 @pytest.mark.parametrize("strength", [0.0, 1e-300, 1e-170, 1e-30])
-def test_errors_do_not_overflow_where_hardly_anything_is_known(strength: float) -> None:
+def test_parameters_with_hardly_any_effect_are_not_determined_and_no_error_overflows(strength):
     """An influence of any size: a warning would be an error here."""
-
-    def faint(stack, wi, wo):
-        return line(stack, wi, wo) + strength * (stack["c"] + stack["d"]) * wo[:, :1]
-
-    free = {**LINE, "c": Free(0.5, 0.0, 1.0), "d": Free(0.5, 0.0, 1.0)}
-    result = fit(free, noisy_line(1.0, 0.5), transport=faint, starts=2)
+    free = {**LINE, "c": Free(0.5, 0.0, 1.0), "d": Free(0.5, 0.0, 1.0), "strength": strength}
+    result = fit(free, noisy_line(), transport=faint, starts=2)
     assert result.insensitive == ("['c']", "['d']")
     assert result.standard_errors["['c']"] == np.inf
-    assert result.standard_errors["['a']"] == pytest.approx(
-        fit(LINE, noisy_line(1.0, 0.5), transport=line, starts=1).standard_errors["['a']"], rel=1e-6
-    )
+    assert result.standard_errors[A] == pytest.approx(0.05 * np.sqrt(np.linalg.inv(DESIGN.T @ DESIGN)[0, 0]), rel=1e-6)
     assert np.isfinite(result.covariance).all()
+    assert result.at_bound == ()
+    if not strength:
+        assert result.condition_number == np.inf
+        assert set(map(repr, result.unidentified)) == {
+            repr(Direction(np.inf, {name: 1.0}, {name: np.inf})) for name in result.insensitive
+        }
+        assert verdicts.identifiability(result)["['c']"] == "insensitive: no effect on the data"
 
 
-def test_two_stacks_that_explain_the_data_equally_well_are_both_reported() -> None:
+def faint(stack, wi, wo):
+    return line(stack, wi, wo) + stack["strength"] * (stack["c"] + stack["d"]) * wo[:, :1]
+
+
+def test_two_stacks_that_explain_the_data_equally_well_are_both_reported():
     def pair(stack, wi, wo):
         return jnp.exp(-stack["p"] / wo[:, 2:]) + jnp.exp(-stack["q"] / wo[:, 2:])
 
-    cosine = design(COUNT)[:, 1:]
-    exact = np.exp(-0.3 / cosine) + np.exp(-1.5 / cosine)
+    exact = np.exp(-0.3 / DESIGN[:, 1:]) + np.exp(-1.5 / DESIGN[:, 1:])
     data = measured(exact + 0.01 * np.random.default_rng(0).standard_normal(exact.shape), 0.01)
     result = fit({"p": Free(0.5, 0.0, 3.0), "q": Free(0.6, 0.0, 3.0)}, data, transport=pair, starts=8)
     assert len(result.minima) >= 2
-    assert len(result.alternatives) == 1
-    best, other = result.values, result.alternatives[0].values
-    assert other["['p']"] == pytest.approx(best["['q']"], rel=1e-4)
-    assert other["['q']"] == pytest.approx(best["['p']"], rel=1e-4)
+    (other,) = result.alternatives
+    assert other.values["['p']"] == pytest.approx(result.values["['q']"], rel=1e-4)
+    assert other.values["['q']"] == pytest.approx(result.values["['p']"], rel=1e-4)
+
+
+# ---- noise, scale and named objectives ----
 
 
 @pytest.mark.parametrize("tails", ["gaussian", "student"])
-def test_free_noise_levels_are_recovered(tails: str) -> None:
+def test_free_noise_levels_are_recovered(tails):
     """Maximum likelihood of a line with constant noise: known in closed form for Gaussian noise."""
     generator = np.random.default_rng(2)
     noise = generator.standard_normal((COUNT, 1)) if tails == "gaussian" else generator.standard_t(4.0, (COUNT, 1))
-    data = measured((design(COUNT) @ [1.0, 0.5])[:, None] + 0.07 * noise)
+    data = measured((DESIGN @ [1.0, 0.5])[:, None] + 0.07 * noise)
     level = Noise(relative=0.0, floor=Free(0.5, 1e-4, 2.0), tails=tails)
     result = fit(LINE, data, transport=line, noise=level, starts=8)
     assert result.converged
     sigma, error = result.values["noise.floor"], result.standard_errors["noise.floor"]
     if tails == "gaussian":
-        regression, sum_of_squares = np.linalg.lstsq(design(COUNT), data.values[:, 0], rcond=None)[:2]
-        np.testing.assert_allclose(result.vector[:2], regression, rtol=1e-5)
-        assert sigma == pytest.approx(np.sqrt(sum_of_squares[0] / COUNT), rel=1e-5)
+        np.testing.assert_allclose(result.vector[:2], regression(data), rtol=1e-5)
+        residuals = data.values[:, 0] - DESIGN @ regression(data)
+        assert sigma == pytest.approx(np.sqrt(np.mean(residuals**2)), rel=1e-5)
         assert error == pytest.approx(sigma / np.sqrt(2 * COUNT), rel=1e-5)
     assert abs(sigma - 0.07) < 4 * error
     assert result.units["noise.floor"] == "1/sr"
 
 
-def test_student_tails_shrug_off_outliers() -> None:
-    data = noisy_line(1.0, 0.5)
-    spoiled = data.values.copy()
+def test_student_tails_shrug_off_outliers():
+    spoiled = noisy_line().values.copy()
     spoiled[::20] += 3.0
-    result = fit(LINE, measured(spoiled, 0.05), transport=line, noise=Noise(tails="student"), starts=4)
-    assert abs(named(result)["a"] - 1.0) < 4 * result.standard_errors["['a']"]
-    gaussian = fit(LINE, measured(spoiled, 0.05), transport=line, starts=4)
-    assert abs(named(gaussian)["a"] - 1.0) > 4 * gaussian.standard_errors["['a']"]
+    for tails in ("student", "gaussian"):
+        found = fit(LINE, measured(spoiled, 0.05), transport=line, noise=Noise(tails=tails), starts=4)
+        assert (abs(found.values[A] - 1.0) < 4 * found.standard_errors[A]) == (tails == "student")
 
 
-def test_a_scale_with_its_prior() -> None:
+def test_a_scale_with_its_prior():
     """Only scale times (a, b) is known; the prior on the logarithm decides the scale, and gives its error."""
     scale = Free(1.0, 0.5, 2.0, LogNormal(1.1, 0.05))
-    result = fit(LINE, noisy_line(1.0, 0.5), transport=line, scale=scale, starts=4)
+    result = fit(LINE, noisy_line(), transport=line, scale=scale, starts=4)
     assert result.scale == pytest.approx(1.1, rel=1e-6)
     assert result.standard_errors["scale"] == pytest.approx(0.05 * 1.1, rel=1e-4)
-    regression = np.linalg.lstsq(design(COUNT), noisy_line(1.0, 0.5).values[:, 0], rcond=None)[0]
-    np.testing.assert_allclose(result.vector[:2] * result.scale, regression, rtol=1e-5)
+    np.testing.assert_allclose(result.vector[:2] * result.scale, regression(noisy_line()), rtol=1e-5)
 
 
-def test_a_named_residual_is_no_posterior() -> None:
-    data = noisy_line(1.0, 0.5)
+def test_a_named_residual_is_no_posterior():
+    data = noisy_line()
     result = fit(LINE, data, transport=line, objective="cosine_l2", starts=4)
-    weighted = design(COUNT) * np.abs(data.wi[:, 2:])
+    weighted = DESIGN * np.abs(data.wi[:, 2:])
     target = data.values[:, 0] * np.abs(data.wi[:, 2])
-    regression, sum_of_squares = np.linalg.lstsq(weighted, target, rcond=None)[:2]
+    found, sum_of_squares = np.linalg.lstsq(weighted, target, rcond=None)[:2]
     covariance = np.linalg.inv(weighted.T @ weighted) * sum_of_squares[0] / (COUNT - 2)
-    np.testing.assert_allclose(result.vector, regression, rtol=1e-6)
+    np.testing.assert_allclose(result.vector, found, rtol=1e-6)
     np.testing.assert_allclose(result.errors, np.sqrt(np.diagonal(covariance)), rtol=1e-6)
     assert not result.is_posterior
     assert np.isnan(result.log_likelihood)
     assert "no likelihood" in result.status
 
 
-def test_starts_that_fail_are_counted_and_not_believed() -> None:
+def test_starts_that_fail_are_counted_and_not_believed():
     def broken(stack, wi, wo):
-        value = line(stack, wi, wo)
-        return jnp.where(stack["a"] > 2.0, jnp.nan, value)
+        return jnp.where(stack["a"] > 2.0, jnp.nan, line(stack, wi, wo))
 
-    result = fit(LINE, noisy_line(1.0, 0.5), transport=broken, starts=16)
+    result = fit(LINE, noisy_line(), transport=broken, starts=16)
     assert result.converged
     assert 1 < result.minima[0].count < 16
     assert f"{16 - result.minima[0].count} of 16 starts failed" in result.status
-
-    result = fit({"a": Free(2.5, 2.1, 3.0), "b": LINE["b"]}, noisy_line(1.0, 0.5), transport=broken, starts=2)
+    result = fit({"a": Free(2.5, 2.1, 3.0), "b": LINE["b"]}, noisy_line(), transport=broken, starts=2)
     assert not result.converged
     assert np.all(np.isinf(result.errors))
     assert result.status.startswith("not converged")
 
 
-def test_a_medium_over_a_base_is_recovered() -> None:
-    """A layerjax stack, in three channels, from simulated slices."""
-    truth = lj.Stack(
-        [lj.Medium(thickness=0.6, albedo=[0.9, 0.7, 0.5], phase=lj.HenyeyGreenstein(g=0.3))],
-        base=lj.Lambertian(albedo=0.4),
-    )
-    free = lj.Stack(
-        [
-            lj.Medium(
-                thickness=Free(1.0, 0.05, 5.0),
-                albedo=Free([0.5, 0.5, 0.5], 0.0, 1.0),
-                phase=lj.HenyeyGreenstein(g=Free(0.0, -0.9, 0.9)),
-            )
-        ],
-        base=lj.Lambertian(albedo=Free(0.5, 0.0, 1.0)),
-    )
-    single = lj.SingleScattering()
-    view = slices(incidence=[10, 40, 60], azimuth=[0, 90])
-    data = simulate(truth, view, transport=single, noise=0.02, seed=3)
-    calls = []
-    result = fit(free, data, transport=single, starts=9, progress=lambda *arguments: calls.append(arguments))
+# ---- stacks of layerjax, and arguments ----
+
+
+def test_a_medium_over_a_base_is_recovered():
+    """In three channels, from simulated slices."""
+
+    def stack(thickness, albedo, g, base):
+        return lj.Stack([lj.Medium(thickness, albedo, lj.HenyeyGreenstein(g))], lj.Lambertian(base))
+
+    unit = 0.0, 1.0
+    free = stack(Free(1.0, 0.05, 5.0), Free([0.5, 0.5, 0.5], *unit), Free(0.0, -0.9, 0.9), Free(0.5, *unit))
+    view, single, calls = slices(incidence=[10, 40, 60], azimuth=[0, 90]), lj.SingleScattering(), []
+    data = simulate(stack(0.6, [0.9, 0.7, 0.5], 0.3, 0.4), view, transport=single, noise=0.02, seed=3)
+    result = fit(free, data, transport=single, starts=9, progress=lambda *call: calls.append(call))
     assert result.converged
     assert result.units["layers[0].thickness"] == "optical depth"
-    expected = [0.6, 0.9, 0.7, 0.5, 0.3, 0.4]
-    assert np.all(np.abs(result.vector - expected) < 4 * result.errors)
+    assert np.all(np.abs(result.vector - [0.6, 0.9, 0.7, 0.5, 0.3, 0.4]) < 4 * result.errors)
     assert result.predicted.shape == data.values.shape
     assert float(result.stack.base.albedo) == result.values["base.albedo"]
     assert [call[:3] for call in calls] == [("fit", done, 9) for done in range(1, 10)]
 
 
+def test_what_is_known_of_the_stack_stays_known_in_a_fit():
+    """A dye that scatters nothing: this transport refuses a medium whose albedo might be anything."""
+
+    def coat(depth):
+        return lj.Stack([lj.Interface(1.5, 0.2), lj.Medium(depth, 0.0)], lj.Conductor(0.2, 3.9, 0.3))
+
+    geometry, transport = slices(incidence=(30,), outgoing=(-20, 20)), lj.WeidlichWilkie()
+    problem = Problem(coat(Free(0.3, 0.0, 1.0)), simulate(coat(0.3), geometry, transport, noise=0.01), transport)
+    exact = simulate(coat(0.3), geometry, transport).values
+    np.testing.assert_allclose(problem.predict([0.3]), exact, rtol=1e-9)
+    assert all(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(problem.build([0.3]).stack))
+
+
+PAINT = lj.Stack([], lj.Lambertian(Free(0.5, 0.0, 1.0)))
 TOML = 'transport = "SingleScattering"\n[base]\nkind = "Lambertian"\nalbedo = { start = 0.5, low = 0.0, high = 1.0 }\n'
 
 
-def test_a_stack_file_sets_thresholds(tmp_path) -> None:
+def test_a_stack_file_sets_thresholds(tmp_path):
     path = tmp_path / "stack.toml"
     for more, expected in (("[options]\nautocorrelation = 0.4\n", FitOptions(autocorrelation=0.4)), ("", FitOptions())):
         path.write_text(TOML + more)
@@ -313,39 +313,15 @@ def test_a_stack_file_sets_thresholds(tmp_path) -> None:
     ("call", "message"),
     [
         (lambda: fit(LINE, line_data(), transport=line, starts=0), "starts: 0 is not a whole number of at least 1"),
-        (lambda: fit(LINE, line_data(), transport=line, solver="newton"), "solver is 'newton'"),
         (lambda: fit(LINE, transport=line), "data: None is not a Measurements"),
+        (lambda: Problem(PAINT, line_data(), lj.RandomWalk()), "RandomWalk is random; use a deterministic one"),
+        (lambda: simulate(PAINT, slices(), lj.RandomWalk()), "RandomWalk is random"),
+        (lambda: Problem(PAINT, line_data(), lj.AddingDoubling(tolerance=0.01)), "0.01 needs concrete parameters"),
         (lambda: FitOptions(same_cost=0.0), r"FitOptions.same_cost is 0.0; it must be a number above 0"),
         (lambda: FitOptions(numerical_error="small"), r"FitOptions.numerical_error is 'small'; it must be a number"),
-        (lambda: FitOptions(autocorrelation=np.inf), r"FitOptions.autocorrelation is inf"),
-        (
-            lambda: options_from({"tolerance": 1.0}),
-            r"\[options\] has an unknown key 'tolerance'; it must be one of same",
-        ),
+        (lambda: options_from({"tolerance": 1.0}), r"\[options\] has an unknown key 'tolerance'; it must be one of"),
     ],
 )
-def test_refused(call, message: str) -> None:
+def test_refused(call, message):
     with pytest.raises(ValueError, match=message):
         call()
-
-
-def test_jaxopt_and_the_sampler_wait_until_it_is_needed() -> None:
-    unused = "[m for m in ('jaxopt', 'arviz', 'emcee', 'h5py') if m in sys.modules]"
-    code = f"import sys, fits.optimise.fit; print({unused})"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "[]"
-
-
-@pytest.mark.parametrize("transport", [lj.ENDF(), lj.WeidlichWilkie()])
-def test_what_is_known_of_the_stack_stays_known_in_a_fit(transport):
-    """A dye that scatters nothing: these transports refuse a medium whose albedo might be anything."""
-
-    def coat(depth):
-        return lj.Stack([lj.Interface(1.5, 0.2), lj.Medium(depth, 0.0)], lj.Conductor(0.2, 3.9, 0.3))
-
-    geometry = slices(incidence=(30,), outgoing=(-20, 20))
-    data = simulate(coat(0.3), geometry, transport=transport, noise=0.01)
-    problem = Problem(coat(Free(0.3, 0.0, 1.0)), data, transport)
-    exact = simulate(coat(0.3), geometry, transport=transport).values
-    np.testing.assert_allclose(problem.predict([0.3]), exact, rtol=1e-9)
-    assert all(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(problem.build([0.3]).stack))

@@ -42,7 +42,7 @@ TWO_BEAMS = """\
 describes them mu_s' would be 4.05."""
 
 
-def coefficients(slab, g: float) -> dict[str, float]:
+def coefficients(slab, g):
     stack = slab.stack(Free(1.0, 0.1, 50.0, LogUniform()), Free(0.05, 1e-3, 5.0, LogUniform()), lj.HenyeyGreenstein(g))
     found = fit(stack, slab.totals, starts=1)
     mu_s, mu_a = (next(v for k, v in found.values.items() if k.endswith(name)) for name in ("mu_s", "mu_a"))
@@ -75,15 +75,23 @@ def test_a_file_of_two_beams_is_what_iad_makes_of_it(tmp_path):
     assert np.max(np.abs(predicted(False, 4.05, 0.0168))) < 0.005
 
 
+def assert_found(folder, text, mu_a, mu_s, g, **reading):
+    """The coefficients of a slab are these, where its file holds this."""
+    path = folder / "slab.rxt"
+    path.write_text(text)
+    found = coefficients(read_slab(path, sigma=0.001, **reading), g)
+    expected = {"mu_a": mu_a, "mu_s'": mu_s * (1.0 - g)}
+    np.testing.assert_allclose([found[name] for name in expected], list(expected.values()), rtol=WITHIN)
+
+
 @pytest.mark.peers
 def test_a_measured_slab_is_what_it_inverts_it_to(tmp_path):
-    path = tmp_path / "pdms.rxt"
-    path.write_text(PDMS)
-    slab = read_slab(path, incidence=8.0, sigma=0.001, corrected=True)
-    found = coefficients(slab, G)
+    (tmp_path / "pdms.rxt").write_text(PDMS)
+    reading = {"incidence": 8.0, "corrected": True}
+    slab = read_slab(tmp_path / "pdms.rxt", sigma=0.001, **reading)
     a, b = inverted(slab.totals.values[:, 0], g=G, n=slab.ior)
-    expected = {"mu_a": b * (1 - a) / slab.thickness_mm, "mu_s'": a * b * (1 - G) / slab.thickness_mm}
-    np.testing.assert_allclose([found[name] for name in expected], list(expected.values()), rtol=WITHIN)
+    thickness = slab.thickness_mm
+    assert_found(tmp_path, PDMS, b * (1 - a) / thickness, a * b / thickness, G, **reading)
 
 
 @pytest.mark.peers
@@ -97,12 +105,9 @@ def test_slabs_of_its_forward_model_are_what_it_inverts_them_to(tmp_path, albedo
     reflected, passed = (float(part) for part in sample.rt()[:2])
     a, b = inverted((reflected, passed), g=g, n=ior, n_above=slides, n_below=slides)
     assert (a, b) == (pytest.approx(albedo, rel=WITHIN), pytest.approx(depth, rel=WITHIN))
-    path = tmp_path / "slab.rxt"
     glass = f"{slides} 1 1" if slides > 1 else "1 1 0"
-    path.write_text(f"IAD1 {ior} {glass} 5 1 0 200 25 12 1 .96 200 25 12 1 .96 2 {reflected} {passed}")
-    found = coefficients(read_slab(path, sigma=0.001), g)
-    expected = {"mu_a": b * (1 - a), "mu_s'": a * b * (1 - g)}
-    np.testing.assert_allclose([found[name] for name in expected], list(expected.values()), rtol=WITHIN)
+    text = f"IAD1 {ior} {glass} 5 1 0 200 25 12 1 .96 200 25 12 1 .96 2 {reflected} {passed}"
+    assert_found(tmp_path, text, b * (1 - a), a * b, g)
 
 
 @pytest.mark.peers
@@ -116,8 +121,5 @@ def test_slabs_that_a_sphere_reads_are_told_from_its_gain(tmp_path, g):
     sphere._r_wall = 0.95
     reflected = ur1 * sphere.gain(0.98) / sphere.gain(uru)
     passed = ut1 * sphere.gain(0.0) / sphere.gain(uru)
-    path = tmp_path / "slab.rxt"
-    path.write_text(f"IAD1 {ior} 1 1 0 5 0.98 1 100 30 15 10 .95 100 30 15 10 .95 2 {reflected} {passed}")
-    found = coefficients(read_slab(path, sigma=0.001), g)
-    expected = {"mu_a": depth * (1 - albedo), "mu_s'": albedo * depth * (1 - g)}
-    np.testing.assert_allclose([found[name] for name in expected], list(expected.values()), rtol=WITHIN)
+    text = f"IAD1 {ior} 1 1 0 5 0.98 1 100 30 15 10 .95 100 30 15 10 .95 2 {reflected} {passed}"
+    assert_found(tmp_path, text, depth * (1 - albedo), albedo * depth, g)

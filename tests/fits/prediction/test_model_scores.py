@@ -31,7 +31,7 @@ from fits.problem.parameters import Free, LogUniform, Normal
 from fits.problem.problem import Problem
 from fits.reports import tables
 from fits.sampling import initial
-from tests.helpers.models import line
+from tests.helpers.models import along, line
 
 SIGMA = 0.05
 GEOMETRY = slices([10.0, 30.0, 50.0], np.arange(-75.0, 76.0, 10.0))
@@ -39,77 +39,60 @@ STACK = {"a": Free(0.9, -4.0, 6.0, Normal(1.0, 0.5)), "b": Free(0.1, -4.0, 5.0, 
 FLAT = {"a": Free(0.9, -4.0, 6.0, Normal(1.0, 0.5)), "b": 0.0}
 
 
-def measurements(seed: int = 0) -> Measurements:
-    exact = np.asarray(line({"a": 1.0, "b": 0.5}, GEOMETRY.wi, GEOMETRY.wo))
-    values = exact + SIGMA * np.random.default_rng(seed).standard_normal(exact.shape)
-    sigma = np.full_like(values, SIGMA)
-    return Measurements(GEOMETRY.wi, GEOMETRY.wo, values, sigma, np.ones(len(values), bool), ("value",))
+EXACT = np.asarray(line({"a": 1.0, "b": 0.5}, GEOMETRY.wi, GEOMETRY.wo))
+COLUMNS = np.stack([np.ones(len(GEOMETRY)), GEOMETRY.wo[:, 2]], axis=-1)
+DATA = along(GEOMETRY, EXACT + SIGMA * np.random.default_rng(0).standard_normal(EXACT.shape), SIGMA)
+
+
+def fitted(stack: dict[str, Any], data: Measurements = DATA, **settings: Any) -> Fit:
+    return fit(stack, data, transport=line, noise=Noise(discrepancy=False), starts=2, **settings)
 
 
 @pytest.fixture(scope="module")
 def found() -> Fit:
-    return fit(STACK, measurements(), transport=line, noise=Noise(discrepancy=False), starts=2)
+    return fitted(STACK)
 
 
 @pytest.fixture(scope="module")
 def flat() -> Fit:
-    return fit(FLAT, measurements(), transport=line, noise=Noise(discrepancy=False), starts=2)
+    return fitted(FLAT)
 
 
-def regression(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Mean and covariance of the parameters, from these rows and the priors."""
-    data = measurements()
-    columns = np.stack([np.ones(len(data)), data.wo[:, 2]], axis=-1)[rows]
-    precision = columns.T @ columns / SIGMA**2 + np.diag(1.0 / np.array([0.5, 0.4]) ** 2)
-    pulled = columns.T @ data.values[rows, 0] / SIGMA**2 + np.array([1.0, 0.5]) / np.array([0.5, 0.4]) ** 2
-    return np.linalg.solve(precision, pulled), np.linalg.inv(precision)
+def held_out_density(rows: np.ndarray) -> np.ndarray:
+    """Log predictive density of these rows by regression on the others, and the priors."""
+    others = np.setdiff1d(np.arange(len(DATA)), rows)
+    x, widths = COLUMNS[others], np.array([0.5, 0.4])
+    precision = x.T @ x / SIGMA**2 + np.diag(widths**-2)
+    mean = np.linalg.solve(precision, x.T @ DATA.values[others, 0] / SIGMA**2 + np.array([1.0, 0.5]) / widths**2)
+    width = np.sqrt(np.sum(COLUMNS[rows] @ np.linalg.inv(precision) * COLUMNS[rows], axis=-1) + SIGMA**2)
+    return stats.norm.logpdf(DATA.values[rows, 0], COLUMNS[rows] @ mean, width)
 
 
-def test_held_out_rows_have_no_influence(found: Fit) -> None:
-    rows = np.arange(len(measurements())) % 3 == 0
-    left = without(found.problem, rows)
-    fewer = Problem(STACK, measurements().where(~rows), line, Noise(discrepancy=False))
-    for vector in (found.vector, np.array([0.0, 2.0])):
-        gaps = [float(of.log_likelihood(vector) - of.log_likelihood([1.0, 0.5])) for of in (left, fewer)]
-        assert gaps[0] == pytest.approx(gaps[1], abs=1e-6)
-
-
-def test_held_out_rows_have_no_influence_on_a_discrepancy() -> None:
-    rows = np.arange(len(measurements())) % 3 == 0
-    noise = Noise(discrepancy=True)
-    whole, fewer = (Problem(STACK, data, line, noise) for data in (measurements(), measurements().where(~rows)))
-    # so few measurements are all inducing points, in both
-    for of in (whole, fewer):
-        np.testing.assert_allclose(np.max(of.model.process.weights, axis=-1), 1.0, atol=1e-6)
+@pytest.mark.parametrize("discrepancy", [False, True])
+def test_held_out_rows_have_no_influence(discrepancy: bool) -> None:
+    """Nor on a discrepancy: so few measurements are all inducing points, with these rows and without them."""
+    rows, noise = np.arange(len(DATA)) % 3 == 0, Noise(discrepancy=discrepancy)
+    whole, fewer = (Problem(STACK, data, line, noise) for data in (DATA, DATA.where(~rows)))
     left = without(whole, rows)
-    moved = whole.start * np.array([1.1, 0.7, 1.5, 0.8, 1.2, 0.6])
-    gaps = [float(of.log_likelihood(moved) - of.log_likelihood(of.start)) for of in (left, fewer)]
-    assert gaps[0] == pytest.approx(gaps[1], abs=1e-3)
+    for factors in (np.linspace(0.5, 1.5, len(whole.start)), np.linspace(1.2, 0.7, len(whole.start))):
+        ends = [factors * whole.start, whole.start]
+        gaps = [float(np.subtract(*map(of.log_likelihood, ends))) for of in (left, fewer)]
+        assert gaps[0] == pytest.approx(gaps[1], abs=1e-3 if discrepancy else 1e-6)
 
 
 def test_held_out_data_are_predicted_by_the_others(found: Fit) -> None:
-    left, data = cross_validate(found, draws=2000), measurements()
+    left = cross_validate(found, draws=2000)
     assert left.groups == ("θᵢ = 10°", "θᵢ = 30°", "θᵢ = 50°")
     assert left.converged
     for rows in left.rows:
-        others = np.setdiff1d(np.arange(len(data)), rows)
-        mean, covariance = regression(others)
-        columns = np.stack([np.ones(rows.size), data.wo[rows, 2]], axis=-1)
-        width = np.sqrt(np.sum(columns @ covariance * columns, axis=-1) + SIGMA**2)
-        expected = stats.norm.logpdf(data.values[rows, 0], columns @ mean, width)
-        np.testing.assert_allclose(left.log_density[rows, 0], expected, atol=0.05)
+        np.testing.assert_allclose(left.log_density[rows, 0], held_out_density(rows), atol=0.05)
     assert left.elpd == pytest.approx(left.elpd_by_group.sum())
 
 
 def test_errors_by_few_draws_are_told(found: Fit) -> None:
     """Beside the exact densities of the regression; and more draws are taken until they are as small as asked for."""
-    data, exact = measurements(), []
     rough = [cross_validate(found, draws=64, seed=seed, options=ComparisonOptions(most_draws=64)) for seed in range(8)]
-    for rows in rough[0].rows:
-        mean, covariance = regression(np.setdiff1d(np.arange(len(data)), rows))
-        columns = np.stack([np.ones(rows.size), data.wo[rows, 2]], axis=-1)
-        width = np.sqrt(np.sum(columns @ covariance * columns, axis=-1) + SIGMA**2)
-        exact.append(stats.norm.logpdf(data.values[rows, 0], columns @ mean, width).sum())
+    exact = [held_out_density(rows).sum() for rows in rough[0].rows]
     off = np.stack([(one.elpd_by_group - exact) / one.errors for one in rough])  # 24 of them
     assert 0.5 < np.sqrt(np.mean(off**2)) < 1.5
     finer = cross_validate(found, draws=64, options=ComparisonOptions(monte_carlo_error=0.1))
@@ -121,10 +104,8 @@ def test_errors_by_few_draws_are_told(found: Fit) -> None:
 @pytest.mark.parametrize("known", [False, True])
 def test_held_out_data_of_a_ridge_are_predicted(known: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     """Only the product of a level and a scale is identified; draws of the whole posterior follow the ridge."""
-    data = measurements(1)
-    level = replace(data, values=1.0 + data.values - np.asarray(line({"a": 1.0, "b": 0.5}, data.wi, data.wo)))
-    stack, scale = {"a": Free(0.5, 0.0, 1.0), "b": 0.0}, Free(1.0, 0.1, 10.0, LogUniform())
-    ridge_fit = fit(stack, level, transport=line, scale=scale, noise=Noise(discrepancy=False), starts=2)
+    level = replace(DATA, values=1.0 + DATA.values - EXACT)
+    ridge_fit = fitted({"a": Free(0.5, 0.0, 1.0), "b": 0.0}, level, scale=Free(1.0, 0.1, 10.0, LogUniform()))
     draws = posterior_draws(ridge_fit) if known else None
     followed: list[Any] = []
     monkeypatch.setattr(initial, "ridge", lambda *given, ridge=initial.ridge: followed.append(given) or ridge(*given))
@@ -138,8 +119,7 @@ def test_held_out_data_of_a_ridge_are_predicted(known: bool, monkeypatch: pytest
 
 
 def test_few_incidences_are_held_out_by_parts_of_scans() -> None:
-    data = measurements()
-    one = data.where(np.abs(data.theta_i - 10.0) < 1.0).used()
+    one = DATA.where(np.abs(DATA.theta_i - 10.0) < 1.0).used()
     groups = groups_of(one)
     assert sorted(np.concatenate(list(groups.values()))) == list(range(len(one)))
     assert len(groups) == 5
@@ -149,34 +129,27 @@ def test_few_incidences_are_held_out_by_parts_of_scans() -> None:
 
 def test_measurements_in_no_group_do_not_count() -> None:
     """One scan at one incidence, and three measurements in another plane, too few to hold some out."""
-    data = measurements()
-    scan = np.abs(data.theta_i - 10.0) < 1.0
+    scan, wo = np.abs(DATA.theta_i - 10.0) < 1.0, DATA.wo.copy()
     aside = np.flatnonzero(scan)[:3]
-    wo = data.wo.copy()
     wo[aside] = wo[aside][:, [1, 0, 2]]
-    few = replace(data, wo=wo).where(scan)
-    left = cross_validate(fit(STACK, few, transport=line, noise=Noise(discrepancy=False), starts=1))
+    left = cross_validate(fitted(STACK, replace(DATA, wo=wo).where(scan)))
     alone = np.setdiff1d(np.arange(scan.sum()), np.concatenate(left.rows))
     assert alone.size == 3
     assert np.all(left.log_density[alone] == 0.0)
     assert left.elpd == pytest.approx(left.elpd_by_group.sum())
 
 
-@pytest.mark.parametrize("stack", ["line", "flat"])
-def test_evidence_is_that_of_regression(found: Fit, flat: Fit, stack: str) -> None:
-    data = measurements()
-    columns = np.stack([np.ones(len(data)), data.wo[:, 2]], axis=-1)
-    prior = np.diag(np.array([0.5, 0.4]) ** 2)
-    mean = columns @ [1.0, 0.5]
-    if stack == "flat":
-        columns, prior, mean = columns[:, :1], prior[:1, :1], np.ones(len(data))
-    covariance = columns @ prior @ columns.T + SIGMA**2 * np.eye(len(data))
-    expected = stats.multivariate_normal(mean, covariance).logpdf(data.values[:, 0])
-    got = evidence(found if stack == "line" else flat, draws=4000)
-    assert got.reliable
-    assert got.error < 0.03
-    # bounds cut less than 1e-8 of the priors off
-    assert got.log_evidence == pytest.approx(expected, abs=5.0 * got.error)
+def test_evidence_is_that_of_regression(found: Fit, flat: Fit) -> None:
+    for one, count in ((found, 2), (flat, 1)):
+        columns, prior = COLUMNS[:, :count], np.diag(np.array([0.5, 0.4])[:count] ** 2)
+        law = stats.multivariate_normal(
+            columns @ [1.0, 0.5][:count], columns @ prior @ columns.T + SIGMA**2 * np.eye(len(DATA))
+        )
+        got = evidence(one, draws=4000)
+        assert got.reliable
+        assert got.error < 0.03
+        # bounds cut less than 1e-8 of the priors off
+        assert got.log_evidence == pytest.approx(law.logpdf(DATA.values[:, 0]), abs=5.0 * got.error)
 
 
 def test_weights_of_stacking_are_the_best() -> None:
@@ -209,7 +182,7 @@ def test_fits_are_ranked_by_elpd(found: Fit, flat: Fit) -> None:
 
 
 def test_averages_are_mixtures(found: Fit, flat: Fit) -> None:
-    candidates, at = {"line": found, "flat": flat}, measurements()
+    candidates, at = {"line": found, "flat": flat}, DATA
     alone = predict(average(candidates, {"line": 1.0, "flat": 0.0}), at, draws=1000)
     one = predict(found, at, draws=1000)
     np.testing.assert_allclose(alone.predictive.mean, one.predictive.mean, atol=0.01)
@@ -217,44 +190,30 @@ def test_averages_are_mixtures(found: Fit, flat: Fit) -> None:
     both = predict(average(candidates, {"line": 3.0, "flat": 1.0}), at, draws=4000)
     parts = [np.exp(predict(of, at, draws=2000).log_density(at.values)) for of in (found, flat)]
     np.testing.assert_allclose(both.log_density(at.values), np.log(0.75 * parts[0] + 0.25 * parts[1]), atol=0.05)
-
-
-def test_more_fits_than_draws_are_averaged(found: Fit) -> None:
-    many = {f"{number}": found for number in range(9)}
-    both = predict(average(many, dict.fromkeys(many, 1.0)), measurements(), draws=4)
-    assert len(both.values) == 4 * 2  # of those that are drawn at all, two
+    many = {f"{number}": found for number in range(9)}  # more than draws: of those that are drawn at all, two
+    both = predict(average(many, dict.fromkeys(many, 1.0)), at, draws=4)
+    assert len(both.values) == 4 * 2
     np.testing.assert_allclose(both.mean, found.predicted, atol=5.0 * SIGMA)
-
-
-@pytest.mark.parametrize(
-    ("weights", "message"),
-    [({"line": 1.0}, "it must give each of line, flat"), ({"line": -1.0, "flat": 2.0}, "a number of at least 0")],
-)
-def test_bad_weights_are_refused(found: Fit, flat: Fit, weights: dict, message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        average({"line": found, "flat": flat}, weights)
-
-
-def test_averages_are_weighted_by_stacking(found: Fit, flat: Fit) -> None:
-    both = average({"line": found, "flat": flat})
-    weights = {name: seen.weight for name, seen in model_scores({"line": found, "flat": flat}).items()}
+    both = average(candidates)  # by stacking
+    weights = {name: seen.weight for name, seen in model_scores(candidates).items()}
     assert both.weights == pytest.approx(weights)
-    assert predict(both, measurements()).scores.count == measurements().values.size
-    with pytest.raises(ValueError, match="there is no fit to average"):
-        average({})
+    assert predict(both, at).scores.count == at.values.size
 
 
-def test_fits_without_a_noise_model_are_refused() -> None:
-    free = {"a": Free(0.9, -4.0, 6.0), "b": Free(0.1, -4.0, 5.0)}
-    named = fit(free, measurements(), transport=line, objective="cube_root", starts=1)
-    with pytest.raises(ValueError, match="a fit of 'cube_root' has no noise model"):
-        cross_validate(named)
-    with pytest.raises(ValueError, match="a fit of 'cube_root' has none"):
-        evidence(named)
-    data = measurements()
-    few = data.where((np.abs(data.theta_i - 10.0) < 1.0) & (data.theta_o < 10.0))
-    with pytest.raises(ValueError, match="too few measurements to hold some"):
-        cross_validate(fit(STACK, few, transport=line, noise=Noise(discrepancy=False), starts=1))
+def test_bad_requests_are_refused(found: Fit, flat: Fit) -> None:
+    two, free = {"line": found, "flat": flat}, {"a": Free(0.9, -4.0, 6.0), "b": Free(0.1, -4.0, 5.0)}
+    named = fit(free, DATA, transport=line, objective="cube_root", starts=1)
+    few = fitted(STACK, DATA.where((np.abs(DATA.theta_i - 10.0) < 1.0) & (DATA.theta_o < 10.0)))
+    for call, message in (
+        (lambda: average(two, {"line": 1.0}), "it must give each of line, flat"),
+        (lambda: average(two, {"line": -1.0, "flat": 2.0}), "a number of at least 0"),
+        (lambda: average({}), "there is no fit to average"),
+        (lambda: cross_validate(named), "a fit of 'cube_root' has no noise model"),
+        (lambda: evidence(named), "a fit of 'cube_root' has none"),
+        (lambda: cross_validate(few), "too few measurements to hold some"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            call()
 
 
 @pytest.mark.parametrize(

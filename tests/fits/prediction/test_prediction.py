@@ -18,7 +18,7 @@ from fits.problem.parameters import Free
 from fits.problem.problem import Problem
 from fits.reports.tables import UNRELIABLE, scores_table
 from fits.sampling.sample import sample
-from tests.helpers.models import COUNT, design, directions, line, line_fit, measured
+from tests.helpers.models import COUNT, along, design, directions, drawn_discrepancy, line, line_fit, measured
 
 STACK = {"a": Free(0.9, 0.1, 3.0), "b": Free(0.1, -1.0, 3.0)}
 GEOMETRY = slices([10.0, 30.0, 50.0, 70.0], np.arange(-80.0, 81.0, 4.0))
@@ -28,23 +28,10 @@ SIGMA = 0.02
 def measurements(seed: int, wrong: float, sigma: float = SIGMA) -> Measurements:
     """Of the line, with smooth errors relative to it, of another shape in every set, and noise."""
     generator = np.random.default_rng(seed)
-    count = len(GEOMETRY)
-    empty = Measurements(GEOMETRY.wi, GEOMETRY.wo, np.ones((count, 1)), None, np.ones(count, bool), ("value",))
     noise = Noise(relative=sigma, floor=1e-4, discrepancy=Discrepancy(max(wrong, 1e-6), 12.0, 12.0, 0.0))
-    model = Problem(STACK, empty, line, noise).model
+    discrepancy = drawn_discrepancy(Problem(STACK, along(GEOMETRY), line, noise), [1.0, 0.5], generator)
     exact = np.asarray(line({"a": 1.0, "b": 0.5}, GEOMETRY.wi, GEOMETRY.wo))
-    process, at = model.process, model.build(np.array([1.0, 0.5])).correlation
-    assert process is not None
-    assert at is not None
-    white = generator.standard_normal((1, len(process.where)))
-    discrepancy = np.asarray(process.sample(white, at))
-    values = exact * (np.exp(discrepancy) + sigma * generator.standard_normal(exact.shape))
-    return Measurements(GEOMETRY.wi, GEOMETRY.wo, values, None, np.ones(count, bool), ("value",))
-
-
-def without_noise(seed: int, wrong: float) -> Measurements:
-    """The BSDF behind `measurements`: its discrepancy is drawn before the noise."""
-    return measurements(seed, wrong, sigma=0.0)
+    return along(GEOMETRY, exact * (np.exp(discrepancy) + sigma * generator.standard_normal(exact.shape)))
 
 
 def split(data: Measurements) -> tuple[Measurements, Measurements]:
@@ -52,10 +39,18 @@ def split(data: Measurements) -> tuple[Measurements, Measurements]:
     return data.where(~held), data.where(held)
 
 
-def test_intervals_of_a_line_are_those_of_regression() -> None:
-    found = line_fit()
-    data = found.problem.data
-    at = predict(found, data, draws=4000)
+def fitted_to(data: Measurements, discrepancy: bool = True) -> Fit:
+    noise = Noise(relative=SIGMA, floor=1e-4, discrepancy=discrepancy)
+    return fit(STACK, data, transport=line, noise=noise, starts=2)
+
+
+@pytest.fixture(scope="module")
+def found() -> Fit:
+    return line_fit()
+
+
+def test_intervals_of_a_line_are_those_of_regression(found: Fit) -> None:
+    at = predict(found, found.problem.data, draws=4000)
     columns = design(COUNT)
     covariance = np.linalg.inv(columns.T @ columns / 0.05**2)
     expected = np.sqrt(np.sum(columns @ covariance * columns, axis=-1))
@@ -65,51 +60,34 @@ def test_intervals_of_a_line_are_those_of_regression() -> None:
     np.testing.assert_allclose(at.latent.mean, found.predicted, atol=0.1 * expected.max())
     wide = at.predictive.quantiles[-1] - at.predictive.quantiles[0]
     np.testing.assert_allclose(wide[:, 0], 2 * stats.norm.ppf(0.975) * np.hypot(expected, 0.05), rtol=0.06)
-
-
-def test_a_posterior_says_the_same() -> None:
-    found = line_fit()
-    posterior = sample(found, walkers=16, max_steps=4000, progress=None)
-    at, by_fit = (predict(of, found.problem.data, draws=1000) for of in (posterior, found))
-    np.testing.assert_allclose(at.predictive.sd, by_fit.predictive.sd, rtol=0.08)
-    np.testing.assert_allclose(at.latent.mean, by_fit.latent.mean, atol=0.2 * by_fit.latent.sd.max())
-    assert at.reliable
-    assert by_fit.reliable
-
-
-def test_draws_that_may_miss_a_part_are_said_to() -> None:
-    found = line_fit()
-    at = predict(found, found.problem.data)
-    assert UNRELIABLE not in scores_table(at, found.problem.data, "").note
-    lost = replace(at, pareto_k=0.8)
-    assert not lost.reliable
-    assert UNRELIABLE in scores_table(lost, found.problem.data, "").note
+    # a chain says the same
+    by_chain = predict(sample(found, walkers=16, max_steps=4000), found.problem.data, draws=1000)
+    np.testing.assert_allclose(by_chain.predictive.sd, at.predictive.sd, rtol=0.08)
+    np.testing.assert_allclose(by_chain.latent.mean, at.latent.mean, atol=0.2 * at.latent.sd.max())
+    # draws that may miss a part are said to
+    for one, unreliable in ((at, False), (by_chain, False), (replace(at, pareto_k=0.8), True)):
+        assert one.reliable != unreliable
+        assert (UNRELIABLE in scores_table(one, found.problem.data, "").note) == unreliable
 
 
 @pytest.mark.slow
 def test_wrong_models_need_a_discrepancy() -> None:
     """Of 10 sets whose model is wrong by 10 %: intervals cover what they say, those of independent noise do not."""
-    held: dict[bool, list[float]] = {True: [], False: []}
-    better = []
-    for seed in range(10):
-        fitted, held_out = split(measurements(seed, 0.1))
-        found = {}
-        for shared in held:
-            noise = Noise(relative=SIGMA, floor=1e-4, discrepancy=shared)
-            found[shared] = predict(fit(STACK, fitted, transport=line, noise=noise, starts=2), held_out).scores
-            held[shared].append(found[shared].coverage[0.95])
-        better.append(found[True].elpd - found[False].elpd)
+    sets = [split(measurements(seed, 0.1)) for seed in range(10)]
+    with_it, alone = (
+        [predict(fitted_to(fitted, discrepancy), held_out).scores for fitted, held_out in sets]
+        for discrepancy in (True, False)
+    )
     # 82 held-out measurements a set are correlated: the standard error of the mean of 10 sets is about 0.03
-    assert 0.86 < np.mean(held[True]) < 0.99
-    assert np.mean(held[False]) < 0.7
-    assert np.mean(better) > 1.0
+    assert 0.86 < np.mean([one.coverage[0.95] for one in with_it]) < 0.99
+    assert np.mean([one.coverage[0.95] for one in alone]) < 0.7
+    assert np.mean([one.elpd - other.elpd for one, other in zip(with_it, alone, strict=True)]) > 1.0
 
 
 @pytest.mark.parametrize("shared", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_quantiles_are_those_of_the_draws(shared: bool) -> None:
     fitted, held_out = split(measurements(3, 0.1))
-    noise = Noise(relative=SIGMA, floor=1e-4, discrepancy=shared)
-    at = predict(fit(STACK, fitted, transport=line, noise=noise, starts=2), held_out)
+    at = predict(fitted_to(fitted, shared), held_out)
     assert np.array_equal(at.mean, at.latent.mean) != shared
     # by 2,048 draws: the standard error of a quantile is at most 0.06 sd, at 4 or 5 of them
     for level, of_bsdf, of_measurement in zip(at.levels, at.bsdf.quantiles, at.predictive.quantiles, strict=True):
@@ -150,15 +128,12 @@ def test_what_is_predicted_first_is_the_bsdf_and_not_the_stack_alone() -> None:
     closer = []
     for seed in range(2):
         fitted, _ = split(measurements(seed, 0.1))
-        _, truth = split(without_noise(seed, 0.1))
-        noise = Noise(relative=SIGMA, floor=1e-4, discrepancy=True)
-        at = predict(fit(STACK, fitted, transport=line, noise=noise, starts=2), truth)
+        _, truth = split(measurements(seed, 0.1, sigma=0.0))  # the discrepancy is drawn before the noise
+        at = predict(fitted_to(fitted), truth)
         exact = truth.used().values
         for name, held in inside.items():
             interval = getattr(at, name)
             held.append(float(np.mean((interval.quantiles[0] < exact) & (exact < interval.quantiles[-1]))))
-        np.testing.assert_array_equal(at.mean, at.bsdf.mean)
-        np.testing.assert_array_equal(at.sd, at.bsdf.sd)
         # a measurement adds independent noise: of the logarithm, which is the relative deviation here
         np.testing.assert_allclose(at.scales**2, at.discrepancy_sd**2 + SIGMA**2, rtol=1e-3)
         closer.append(np.median(np.abs(at.mean / exact - 1.0)) / np.median(np.abs(at.latent.mean / exact - 1.0)))
@@ -178,8 +153,7 @@ def test_directions_below_an_opaque_stack_are_refused(coat_fit: Fit) -> None:
 
 def test_right_models_lose_little_by_it() -> None:
     fitted, held_out = split(measurements(1, 0.0))
-    noise = Noise(relative=SIGMA, floor=1e-4, discrepancy=True)
-    found = fit(STACK, fitted, transport=line, noise=noise, starts=2)
+    found = fitted_to(fitted)
     assert found.values["noise.discrepancy.amplitude"] < SIGMA
     got = predict(found, held_out).scores
     assert got.coverage[0.95] > 0.9
@@ -188,37 +162,28 @@ def test_right_models_lose_little_by_it() -> None:
 
 def test_noise_elsewhere_is_that_of_what_was_fitted() -> None:
     fitted, _ = split(measurements(2, 0.0))
-    sigma = SIGMA * fitted.values
-    known = Measurements(fitted.wi, fitted.wo, fitted.values, sigma, fitted.mask, fitted.channels)
+    known = replace(fitted, sigma=SIGMA * fitted.values)
     found = fit(STACK, known, transport=line, starts=2)
-    at = predict(found, slices([30.0], np.arange(-60.0, 61.0, 20.0)))
+    at, again = (predict(found, slices([30.0], np.arange(-60.0, 61.0, 20.0))) for _ in range(2))
     np.testing.assert_allclose(at.scales, SIGMA * np.abs(at.means), rtol=0.05)
-    again = predict(found, slices([30.0], np.arange(-60.0, 61.0, 20.0)))
     np.testing.assert_array_equal(at.predictive.quantiles, again.predictive.quantiles)
 
 
-def test_bad_requests_are_refused() -> None:
-    found = line_fit()
-    with pytest.raises(ValueError, match=r"levels\[1\] is 1.0; it must be in \(0, 1\)"):
-        predict(found, found.problem.data, levels=(0.5, 1.0))
-    directions = predict(found, slices([30.0]), draws=2)
-    for quantile in (directions.quantile, directions.predictive_quantile):
-        with pytest.raises(ValueError, match=r"level is 0.0; it must be in \(0, 1\)"):
-            quantile(0.0)
-    with pytest.raises(ValueError, match="a Geometry was predicted"):
-        _ = directions.scores
-    with pytest.raises(ValueError, match=r"draws: 1 is not a whole number of at least 2"):
-        predict(found, found.problem.data, draws=1)
-    named = fit(STACK, found.problem.data, transport=line, objective="cube_root", starts=1)
-    with pytest.raises(ValueError, match=r"a fit of 'cube_root' has no noise model"):
-        predict(named, found.problem.data)
-    data = found.problem.data
-    colours = Measurements(data.wi, data.wo, np.tile(data.values, 3), None, data.mask, ("r", "g", "b"))
-    with pytest.raises(ValueError, match=r"the measurements have the channels r, g, b, the fit c0"):
-        predict(found, colours)
-    at = predict(found, slices([30.0]))
-    with pytest.raises(ValueError, match=r"the measurements have other directions"):
-        scores(at, found.problem.data)
+def test_bad_requests_are_refused(found: Fit) -> None:
+    data, at = found.problem.data, predict(found, slices([30.0]), draws=2)
+    named = fit(STACK, data, transport=line, objective="cube_root", starts=1)
+    for call, message in (
+        (lambda: predict(found, data, levels=(0.5, 1.0)), r"levels\[1\] is 1.0; it must be a number in \(0, 1\)"),
+        (lambda: at.quantile(0.0), r"level is 0.0; it must be a number in \(0, 1\)"),
+        (lambda: at.predictive_quantile(1.0), r"level is 1.0; it must be a number in \(0, 1\)"),
+        (lambda: at.scores, "a Geometry was predicted"),
+        (lambda: scores(at, data), "the measurements have other directions"),
+        (lambda: predict(found, data, draws=1), "draws: 1 is not a whole number of at least 2"),
+        (lambda: predict(named, data), "a fit of 'cube_root' has no noise model"),
+        (lambda: predict(found, along(data, channels="rgb")), "measurements have the channels r, g, b, the fit c0"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            call()
 
 
 @pytest.mark.parametrize("sigma", [0.02, 0.001])

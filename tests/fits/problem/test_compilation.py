@@ -26,22 +26,14 @@ def most(model: tuple[()]) -> jax.Array:
     return io_callback(lambda: np.int32(max(threads())), jax.ShapeDtypeStruct((), jnp.int32))
 
 
-def test_matrices_are_solved_by_one_thread_and_the_others_come_back() -> None:
+def test_matrices_are_solved_by_one_thread_and_the_others_come_back_after_the_last_call() -> None:
+    """Also of programs that other threads run, when this one has set a limit before."""
     arrays, static = eqx.partition((), eqx.is_array)
-    with threadpool_limits(2):
-        assert int(run(most, (arrays, Static(static)))) == 1
-        assert threads() == {2}
-
-
-def test_programs_of_other_threads_are_limited_too() -> None:
-    arrays, static = eqx.partition((), eqx.is_array)
-    with threadpool_limits(2), ThreadPoolExecutor(2) as pool:  # this thread has set a limit before
+    with threadpool_limits(2), ThreadPoolExecutor(2) as pool:
         program = (arrays, Static(static))
+        assert int(run(most, program)) == 1
         assert [int(seen) for seen in pool.map(lambda _: run(most, program), range(4))] == [1] * 4
         assert threads() == {2}
-
-
-def test_the_others_come_back_once_the_last_call_is_done() -> None:
     first, second = one_thread(), one_thread()
     with threadpool_limits(2):
         first.__enter__()

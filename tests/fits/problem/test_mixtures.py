@@ -8,9 +8,9 @@ import pytest
 import fits
 import layerjax as lj
 from benchmarks.measuring.repeats import fit_many
-from fits.cli.parser import main
 from fits.problem.parameters import Free
 from fits.problem.problem import Problem
+from fits.reports.html import FitReport
 
 FILE = """\
 transport = "SingleScattering"
@@ -59,6 +59,10 @@ def test_files_are_read_and_written(file: Path, tmp_path: Path) -> None:
     assert one.names == other.names == NAMES
     np.testing.assert_array_equal([one.start, one.low], [other.start, other.low])
     np.testing.assert_allclose(one.predict(one.start), other.predict(other.start))
+    found = fits.fit(given.stack, simulated(0.03), transport=SINGLE, starts=1)
+    fits.save_fit(found, tmp_path / "result")
+    assert tuple(fits.load_fit(tmp_path / "result").values) == NAMES
+    assert "[mixture.dust]" in FitReport(found).page()
 
 
 def test_shares_are_recovered(file: Path) -> None:
@@ -86,15 +90,6 @@ def test_all_orders_choose_one_resolution_for_all_parts() -> None:
     assert found.numerical_error < 0.1
     for name, value in (("weights.coat", 0.7), ("coat.layers[0].alpha", 0.2)):
         assert abs(found.values[name] - value) < 4.0 * found.standard_errors[name]
-
-
-def test_it_is_fitted_and_reported_on_the_command_line(file: Path, tmp_path: Path, capsys) -> None:
-    fits.write_csv(simulated(0.03), tmp_path / "dusty.csv")
-    arguments = ["fit", tmp_path / "dusty.csv", "--stack", file, "--out", tmp_path / "result", "--starts", "2"]
-    assert main([str(word) for word in arguments]) == 0
-    assert "weights.dust" in capsys.readouterr().out
-    assert tuple(fits.load_fit(tmp_path / "result").values) == NAMES
-    assert "[mixture.dust]" in (tmp_path / "result" / "report.html").read_text()
 
 
 WEIGHT = "weight = { start = 0.5, low = 0.0, high = 1.0 }"

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 import layerjax as lj
-from fits.cli.parser import main
 from fits.problem.discrepancy import Discrepancy
 from fits.problem.instrument import Instrument
 from fits.problem.noise import Noise
@@ -100,23 +99,16 @@ def test_everything_in_a_file_arrives_and_is_written_again(tmp_path):
     with pytest.raises(ValueError, match=r"again.toml: there is no .instrument."):
         read_instrument(path)
 
-
-@pytest.mark.parametrize("given", [True, False, Discrepancy(), Discrepancy(0.05, Free(12.0, 8.0, 20.0))])
-def test_noise_with_discrepancy_is_kept(tmp_path: Path, given: Discrepancy | bool) -> None:
-    write_problem(tmp_path / "stack.toml", lj.Stack([], lj.Lambertian(0.5)), noise=Noise(0.03, discrepancy=given))
-    assert read_problem(tmp_path / "stack.toml").noise == Noise(0.03, discrepancy=given)
+    for given in (True, False, Discrepancy(0.05)):
+        write_problem(path, problem.stack, noise=Noise(0.03, discrepancy=given), force=True)
+        assert read_problem(path).noise == Noise(0.03, discrepancy=given)
 
 
-class Ghost(lj.Rayleigh):
-    """A phase function of one's own: a file could name it, but nothing could read it back."""
-
-
-class Painted(lj.Lambertian):
-    """A base of one's own."""
-
-
-class Careful(lj.SingleScattering):
-    """A transport of one's own."""
+# of one's own: a file could name them, but nothing could read them back
+Ghost, Painted, Careful = (
+    type(name, (kind,), {})
+    for name, kind in (("Ghost", lj.Rayleigh), ("Painted", lj.Lambertian), ("Careful", lj.SingleScattering))
+)
 
 
 @pytest.mark.parametrize(
@@ -136,21 +128,16 @@ def test_what_could_not_be_read_back_is_not_written(tmp_path, stack, transport, 
 LAW = PowerLaw(Free(4.0, 0.1, 50.0), Free(0.0, -4.0, 4.0), (450.0, 550.0), 600.0)
 
 
-@pytest.mark.parametrize(
-    "stack",
-    [
+def test_dictionary_round_trip():
+    """Numbers in single precision stay short."""
+    for stack in (
         lj.Stack([], base=lj.Conductor(ior=[0.2, 0.9, 1.1], k=3.9, alpha=0.1)),
         lj.Stack([], base=lj.VMFDiffuse(Free(0.4, 0.0, [0.8, 0.9, 1.0]), Free(0.3, 0.0, 1.0), form="all_orders")),
         lj.Stack([lj.Medium(thickness=1 / 3, phase=lj.HenyeyGreenstein(g=Free(0.1, -0.9, 0.9)), f0=0.04)]),
         lj.Stack([lj.Medium(Free(1.0, 0.1, 10.0, LogUniform()), phase=lj.Rayleigh())], lj.OrenNayar(0.5, 0.3)),
         lj.Stack([lj.TurbidMedium(0.2, LAW, 0.5, lj.HenyeyGreenstein(0.3))]),
-    ],
-)
-def test_dictionary_round_trip(stack):
-    assert_same(stack_from_dict(stack_to_dict(stack)), stack)
-
-
-def test_numbers_in_single_precision_stay_short():
+    ):
+        assert_same(stack_from_dict(stack_to_dict(stack)), stack)
     stack = jax.tree.map(lambda leaf: leaf.astype("float32"), lj.Stack([], base=lj.Lambertian(albedo=np.float32(0.9))))
     assert stack_to_dict(stack) == {"base": {"kind": "Lambertian", "albedo": 0.9}}
 
@@ -159,20 +146,13 @@ FREE = LAYER + "thickness = {{ start = 1, low = 0, high = 2{} }}\n"
 PHASE = LAYER + "thickness = 1\nphase = {{ kind = 'SGGX', {} }}\n"
 WRONG = {
     "": "neither a layer nor a base",
-    "[base\n": "not valid TOML",
-    BASE * 2: "not valid TOML",
     LAYER + "thickness = 1\nalbdo = 0.5\n": r"layers\[0\] has an unknown key 'albdo' \(did you mean 'albedo'\?\); allo",
     BASE + "about = { year = 2022 }\n": r"about\['year'\] is 2022, must be a text",
     BASE + "bse = 3\n": "the file has an unknown key 'bse'",
-    LAYER + "thickness = 'thick'\n": r"layers\[0\].thickness is 'thick', must be a number in \[0, 10000\]",
-    LAYER + "thickness = true\n": r"layers\[0\].thickness is True",
-    LAYER + "thickness = nan\n": r"layers\[0\].thickness is nan, must be a number in \[0, 10000\]",
     LAYER + "thickness = -1\n": r"layers\[0\].thickness is -1, must be a number in \[0, 10000\]",
-    LAYER + "thickness = []\n": r"layers\[0\].thickness is an empty list",
     LAYER + "albedo = 0.5\n": r"layers\[0\] \(Medium\) has no thickness",
     "[[layers]]\nthickness = 1\n": r"layers\[0\] has no kind, must be one of Interface, Medium",
     "[[layers]]\nkind = 'Mediun'\n": r"layers\[0\].kind is 'Mediun' \(did you mean 'Medium'\?\)",
-    "layers = 3\n": "layers is not a list of tables",
     FREE.replace("start = 1", "start = 9").format(
         ""
     ): r"layers\[0\].thickness: start is 9.0; it must lie in \[0.0, 2.0\]",
@@ -180,33 +160,21 @@ WRONG = {
     FREE.replace(", high = 2", "").format(""): r"layers\[0\].thickness has no high",
     FREE.replace("high = 2", "high = 1e6").format(""): r"layers\[0\].thickness.high is 1e\+06, must be",
     FREE.format(", hihg = 2"): r"layers\[0\].thickness has an unknown key 'hihg'",
-    FREE.format(", prior = 'Normal'"): r"layers\[0\].thickness.prior is 'Normal', must be a table",
-    FREE.format(", prior = { kind = 'Normal', mean = 1 }"): r"layers\[0\].thickness.prior \(Normal\) has no sd",
     FREE.format(", prior = { kind = 'Normal', mean = 1, sd = -1 }"): r"layers\[0\].thickness.prior: Normal.sd is -1",
     FREE.format(", prior = { kind = 'LogUniform' }"): r"layers\[0\].thickness: low is 0.0; it must be above 0",
-    LAYER + "thickness = 1\nphase = 'SGGX'\n": r"layers\[0\].phase is 'SGGX', must be a table",
     PHASE.format("shape = 'ball', alpha = 0.1"): r"layers\[0\].phase.shape is 'ball', must be one of surface, fiber",
     PHASE.format("shape = 'fiber', alpha = 0.1, axis = [1, 0]"): r"layers\[0\].phase: SGGX.axis: shape \(2,\)",
-    BASE + "noise = { relativ = 0.1 }\n": "noise has an unknown key 'relativ'",
-    BASE + "noise = { use_sigma = 1 }\n": "noise.use_sigma is 1, must be true or false",
     BASE + "noise = { relative = -1 }\n": "noise.relative is -1",
-    BASE + "noise = { tails = 'fat' }\n": "noise.tails is 'fat', must be one of gaussian, student",
-    BASE + "noise = { degrees_of_freedom = { start = 1 } }\n": "noise.degrees_of_freedom is",
-    BASE + "noise = { discrepancy = 0.1 }\n": "noise.discrepancy is 0.1",
-    BASE + "noise = { discrepancy = { angle = 3.0 } }\n": "noise.discrepancy has an unknown key 'angle'",
     BASE + "noise = { discrepancy = { length_half = -3.0 } }\n": "noise.discrepancy.length_half is -3.0",
     BASE + "noise = { discrepancy = { length_half = { low = 5.0 } } }\n": "noise.discrepancy.length_half has no start",
     BASE + "scale = { start = 1, low = -1, high = 2 }\n": r"scale.low is -1, must be a number in \[1e-100, 1e\+100\]",
     BASE + "scale = { start = [1, 1], low = 0.5, high = 2 }\n": "scale has 2 channels, must be one number for all",
     BASE + "instrument = { detector_aperture = 31 }\n": r"instrument.detector_aperture is 31.0; .* in \[0, 30\]",
-    BASE + "instrument = { rings = 0 }\n": r"instrument.rings is 0; it must be an integer in \[1, 8\]",
+    BASE + "instrument = { rings = 0 }\n": "instrument.rings: 0 is not a whole number from 1 to 8",
     BASE + "instrument = { aperture = 1 }\n": "instrument has an unknown key 'aperture'",
-    BASE + "instrument = { tilt = { start = 0, low = -1 } }\n": "instrument.tilt has no high",
     BASE + "transport = 'Singlescattering'\n": "transport is 'Singlescattering' .did you mean 'SingleScattering'",
     BASE
     + "transport = { kind = 'AddingDoubling', ordinates = [8, 12.5] }\n": r"ordinates is \[8, 12.5\], must be a list",
-    BASE + "transport = { kind = 'AddingDoubling', nodes = 1.5 }\n": "transport.nodes is 1.5, must be a whole number",
-    BASE + "objective = 'best'\n": "objective is 'best', must be one of likelihood",
     "[base]\nkind = 'Lambertian'\nalbedo = [0.1, 0.2]\n"
     + LAYER
     + "thickness = [1, 2, 3]\n": "disagree on the number of",
@@ -269,10 +237,9 @@ PLACES = {
     "axis": MEDIUM % 'phase = { kind = "SGGX", shape = "fiber", alpha = 0.5, axis = @ }',
     "layers[0].phase.axis": MEDIUM % 'phase = { kind = "SGGX", shape = "fiber", alpha = 0.5, axis = [0, 0, @] }',
     "layers[0].distribution": 'layers = [{ kind = "Interface", ior = 1.5, alpha = 0.1, distribution = @ }]\n',
-    **{
-        f"layers[0].thickness.{end}": NUMBER.replace(f"{end} = ", f"{end} = @#") % ""
-        for end in ("start", "low", "high")
-    },
+    "layers[0].thickness.start": NUMBER.replace("1.0", "@") % "",
+    "layers[0].thickness.low": NUMBER.replace("0.5", "@") % "",
+    "layers[0].thickness.high": NUMBER.replace("2.0", "@") % "",
     "layers[0].thickness.prior": NUMBER % ", prior = @",
     "layers[0].thickness.prior.mean": NUMBER % ', prior = { kind = "Normal", mean = @, sd = 0.1 }',
     "layers[0].thickness.prior.sd": NUMBER % ', prior = { kind = "Normal", mean = 1.0, sd = @ }',
@@ -296,9 +263,6 @@ PLACES = {
     "scale.prior.sd": SCALE % ', prior = { kind = "LogNormal", median = 1.0, sd = @ }',
     "about.source": BASE + "about = { source = @ }\n",
     "mystery": BASE + "mystery = @\n",
-}
-PLACES = {
-    place: text.replace("@#1.0", "@").replace("@#0.5", "@").replace("@#2.0", "@") for place, text in PLACES.items()
 }
 VALUES = {
     "309 digits": "9" * 309,
@@ -380,15 +344,3 @@ def test_priors_that_cannot_be_computed_with_are_refused(tmp_path: Path, prior: 
     assert message is not None
     assert message.startswith("base.albedo")
     assert words in message
-
-
-@pytest.mark.parametrize("name", ["309 digits", "arrays 20000 deep"])
-def test_the_command_line_says_so_on_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str) -> None:
-    path = tmp_path / "stack.toml"
-    path.write_text(PLACES["layers[0].thickness"].replace("@", VALUES[name]))
-    assert main(["simulate", "--stack", str(path), "--out", str(tmp_path / "new.csv")]) == 2
-    output = capsys.readouterr()
-    assert (output.out, output.err.count("\n")) == ("", 1)
-    assert output.err.startswith(f"layerjax: error: {path}: ")
-    assert len(output.err) < 300 + len(str(path))
-    assert not (tmp_path / "new.csv").exists()

@@ -26,10 +26,8 @@ def text(html: str) -> str:
 
 def chain(fit: Fit, converged: bool) -> Posterior:
     """Independent draws about the best values: 500 steps of 8 walkers."""
-    spread = np.random.default_rng(0).standard_normal((500, 8, len(fit.vector)))
-    steps = fit.vector + fit.errors * spread
-    time = np.full(len(fit.vector), 1.0)
-    return Posterior(fit, steps, np.zeros(steps.shape[:2]), time, acceptance=0.4, converged=converged)
+    steps = fit.vector + fit.errors * np.random.default_rng(0).standard_normal((500, 8, len(fit.vector)))
+    return Posterior(fit, steps, np.zeros((500, 8)), np.ones(len(fit.vector)), acceptance=0.4, converged=converged)
 
 
 def test_a_fit_is_its_verdict_and_its_values(coat_fit: Fit) -> None:
@@ -82,10 +80,8 @@ def test_a_comparison_is_its_verdict_and_its_table(result: Fit) -> None:
 
 
 def test_words_are_short_and_on_one_line(result: Fit, coat_data: Measurements) -> None:
-    assert (
-        repr(coat_data)
-        == f"<Measurements: {len(coat_data)} data points, 10 of them masked, of value, from simulated data>"
-    )
+    words = f"{len(coat_data)} data points, 10 of them masked, of value, from simulated data"
+    assert repr(coat_data) == f"<Measurements: {words}>"
     assert repr(fits.slices(incidence=[10, 30], outgoing=[0, 20])) == "<Geometry: 4 pairs of directions>"
     assert repr(result).startswith(f"<Fit to 100 measurements: ['a'] {result.vector[0]:.4g} ± ")
     assert repr(chain(result, True)) == "<Posterior of ['a'], ['b']: 500 steps of 8 walkers, converged>"

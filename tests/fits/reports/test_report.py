@@ -7,10 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
+from scipy.signal import lfilter
 
 import layerjax as lj
 from fits.any_report import report
-from fits.data.geometry import direction, slices
+from fits.data.geometry import Geometry, direction, slices
 from fits.data.measurements import Measurements, Source
 from fits.data.scans import correlation, in_plane, incidences, neighbours, relative_azimuth, signed_angle
 from fits.optimise.fit import fit
@@ -23,18 +24,16 @@ from fits.reports.html import FitReport
 from fits.reports.plots import data as pictures
 from fits.reports.plots import model as model_pictures
 from fits.reports.verdicts import assess
+from tests.helpers.models import along
 
 
-def measurements(theta_i: list[float], phi_i: list[float], theta_o: list[float], phi_o: list[float]) -> Measurements:
-    count = len(theta_i)
-    wi, wo = direction(theta_i, phi_i), direction(theta_o, phi_o)
-    return Measurements(wi, wo, np.ones((count, 1)), None, np.ones(count, bool), ("value",))
+def measurements(theta_i, phi_i, theta_o, phi_o) -> Measurements:
+    angles = np.broadcast_arrays(theta_i, phi_i, theta_o, phi_o)
+    return along(Geometry(direction(*angles[:2]), direction(*angles[2:])))
 
 
 def test_the_viewing_angle_is_positive_on_the_mirror_side() -> None:
-    phi_i = np.array([180.0, 180.0, 37.0, 300.0, 180.0, 180.0])
-    phi_o = np.array([0.0, 180.0, 217.0, 120.0, 60.0, 120.0])
-    data = measurements([30.0] * 6, phi_i.tolist(), [20.0] * 6, phi_o.tolist())
+    data = measurements(30.0, [180, 180, 37, 300, 180, 180], 20.0, [0, 180, 217, 120, 60, 120])
     np.testing.assert_allclose(signed_angle(data), [20, -20, 20, 20, 20, -20], atol=1e-9)
     np.testing.assert_allclose(relative_azimuth(data), [0, 180, 0, 0, 60, 120], atol=1e-9)
     np.testing.assert_array_equal(in_plane(data), [True, True, True, True, False, False])
@@ -43,47 +42,35 @@ def test_the_viewing_angle_is_positive_on_the_mirror_side() -> None:
     assert in_plane(normal).all()
 
 
-JITTER = [(0.15, None, [4, 5]), (30.27, 0.0, [0, 1, 2]), (30.74, 0.0, [3]), (50.0, 90.0, [6]), (50.0, 90.6, [7])]
+ANGLES = [10.0, 30.0, 10.0, 30.0, 10.0], [180.0, 180.0, 0.0, 180.0, 180.0]
+JITTERED = [30.24, 30.26, 30.3, 30.74, 0.1, 0.2, 50.0, 50.0], [359.9, 0.1, 0.0, 0.0, 10.0, 200.0, 90.0, 90.6]
 
 
-@pytest.mark.parametrize(
-    ("theta", "phi", "groups"),
-    [
-        # incidences differ by either angle
-        (
-            [10, 30, 10, 30, 10],
-            [180, 180, 0, 180, 180],
-            [(10.0, 0.0, [2]), (10.0, 180.0, [0, 4]), (30.0, 180.0, [1, 3])],
-        ),
-        # and are the same within the jitter of an instrument
-        ([30.24, 30.26, 30.3, 30.74, 0.1, 0.2, 50, 50], [359.9, 0.1, 0.0, 0.0, 10.0, 200.0, 90.0, 90.6], JITTER),
-    ],
-)
-def test_rows_of_one_incidence(
-    theta: list[float], phi: list[float], groups: list[tuple[float, float | None, list[int]]]
-) -> None:
-    found = incidences(measurements(theta, phi, [5] * len(theta), [0] * len(theta)))
-    for group, (polar, azimuth, rows) in zip(found, groups, strict=True):
-        assert group.rows.tolist() == rows
-        assert group.theta == pytest.approx(polar, abs=0.005)
-        assert azimuth is None or group.phi == pytest.approx(azimuth, abs=0.005)
+def test_rows_of_one_incidence() -> None:
+    """Incidences differ by either angle, and are the same within the jitter of an instrument."""
+    for (theta, phi), groups in (
+        (ANGLES, [(10.0, 0.0, [2]), (10.0, 180.0, [0, 4]), (30.0, 180.0, [1, 3])]),
+        (JITTERED, [(0.15, None, [4, 5]), (30.27, 0.0, [0, 1, 2]), (30.74, 0.0, [3]), (50.0, 90.0, [6]),
+                    (50.0, 90.6, [7])]),
+    ):  # fmt: skip
+        for group, (polar, azimuth, rows) in zip(incidences(measurements(theta, phi, 5.0, 0.0)), groups, strict=True):
+            assert group.rows.tolist() == rows
+            assert group.theta == pytest.approx(polar, abs=0.005)
+            assert azimuth is None or group.phi == pytest.approx(azimuth, abs=0.005)
 
 
 def series(correlation: float, count: int, seed: int) -> np.ndarray:
     """A stationary autoregressive series of unit variance."""
-    draws = np.random.default_rng(seed).standard_normal(count)
-    values = [draws[0]]
-    for draw in draws[1:]:
-        values.append(correlation * values[-1] + np.sqrt(1 - correlation**2) * draw)
-    return np.array(values)
+    draws = np.random.default_rng(seed).standard_normal(count) * np.sqrt(1 - correlation**2)
+    draws[0] /= np.sqrt(1 - correlation**2)
+    return lfilter([1.0], [1.0, -correlation], draws)
 
 
 @pytest.mark.parametrize("given", [0.0, 0.8])
 def test_the_correlation_of_neighbours_is_recovered(given: float) -> None:
     count = 4000
     shuffled, angle = np.random.default_rng(0).permutation(count), np.linspace(-80, 80, count)
-    phi_o = np.where(angle < 0, 180.0, 0.0)
-    data = measurements([30] * count, [180] * count, np.abs(angle).tolist(), phi_o.tolist())
+    data = measurements(30.0, 180.0, np.abs(angle), np.where(angle < 0, 180.0, 0.0))
     pairs = neighbours(replace(data, wo=data.wo[shuffled]), series(given, count, seed=5)[shuffled, None])
     # the standard error of a lag-one correlation r is sqrt((1 - r^2) / n)
     assert abs(correlation(*pairs) - given) < 4 * np.sqrt((1 - given**2) / count)
@@ -104,20 +91,6 @@ def test_masked_rows_have_no_residual(coat_fit: Fit) -> None:
     label, count, _, rms = tables.incidence_table(coat_fit).rows[-1]
     assert (label, int(count)) == ("all", len(residuals) - 10)
     assert float(rms) ** 2 * int(count) == pytest.approx(coat_fit.chi_square, rel=0.02)
-
-
-@pytest.mark.parametrize(
-    ("value", "error", "words"),
-    [
-        (0.53217, 0.0214, ("0.532", "0.021")),
-        (1234.567, 12.0, ("1235", "12")),
-        (0.5, float("nan"), ("0.5", "unknown")),
-        (1e-7, 2.5e-9, ("1e-07", "2.5e-09")),
-        (123456.0, 34567.0, ("123456", "34567")),
-    ],
-)
-def test_numbers_stand_to_two_digits_of_their_error(value: float, error: float, words: tuple[str, str]) -> None:
-    assert tables.with_error(value, error) == words
 
 
 def test_the_report_holds_everything(coat_fit: Fit, tmp_path: Path) -> None:
@@ -172,9 +145,6 @@ def test_curves_show_data_model_and_residuals(coat_fit: Fit) -> None:
     assert isinstance(figure, Figure)
     assert len(figure.axes) == 4  # two incidences, each with its residuals
     upper, lower = figure.axes[:2]
-    assert upper.get_title(loc="left") == "θᵢ = 10°"
-    assert "1/sr" in upper.get_ylabel()
-    assert "degrees" in figure.get_supxlabel()
     line = next(line for line in upper.lines if line.get_label() == "model")
     data, used = coat_fit.problem.data, coat_fit.problem.data.mask
     rows = np.flatnonzero(used & in_plane(data) & (data.theta_i == 10))
@@ -194,17 +164,10 @@ def test_maps_only_where_data_leaves_the_plane(coat_fit: Fit) -> None:
     only = replace(data, wi=data.wi[kept], wo=data.wo[kept], values=data.values[kept], sigma=None, mask=data.mask[kept])
     assert model_pictures.maps_picture(replace(coat_fit, problem=replace(coat_fit.problem, data=only))) is None
     assert len(pictures.data_picture(only).axes) == 1
-
-
-@pytest.mark.parametrize("azimuth", [60.0, (0.0, 90.0), tuple(range(0, 180, 10))])
-def test_data_out_of_plane_is_drawn_however_it_lies(azimuth: float | tuple[float, ...]) -> None:
-    geometry = slices(incidence=(0, 40), azimuth=azimuth)
-    count = len(geometry)
-    data = Measurements(geometry.wi, geometry.wo, np.zeros((count, 1)), None, np.ones(count, bool), ("value",))
-    assert pictures.as_png(pictures.data_picture(data)).startswith(b"\x89PNG")
+    for azimuth in (60.0, (0.0, 90.0), tuple(range(0, 180, 10))):  # drawn however it lies, and though it is dark
+        dark = along(slices(incidence=(0, 40), azimuth=azimuth), 0.0)
+        assert pictures.as_png(pictures.data_picture(dark)).startswith(b"\x89PNG")
 
 
 def test_axes_are_logarithmic_where_the_range_is_wide() -> None:
-    assert pictures.is_logarithmic(np.array([0.0, 0.01, 0.2]))
-    assert not pictures.is_logarithmic(np.array([0.0, 0.1, 0.2]))
-    assert not pictures.is_logarithmic(np.array([0.0]))
+    assert [pictures.is_logarithmic(np.array(values)) for values in ([0, 0.01, 0.2], [0, 0.1, 0.2], [0])] == [1, 0, 0]

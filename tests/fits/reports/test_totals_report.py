@@ -16,28 +16,6 @@ from fits.reports.plots.data import totals_picture
 from tests.helpers.commands import refused
 
 SPHERES = fits.Spheres(fits.Sphere(100.0, 20.0, 5.0, 8.0, 0.95), fits.Sphere(90.0, 20.0, wall=0.97), 0.98, True)
-STACK = """\
-transport = "SingleScattering"
-[[layers]]
-kind = "Medium"
-thickness = { start = 0.5, low = 0.01, high = 5.0 }
-albedo = 0.0
-[base]
-kind = "Lambertian"
-albedo = { start = 0.5, low = 0.0, high = 1.0 }
-"""
-CSV = """\
-theta_i,total_reflectance,total_reflectance_sigma
-0,0.30,0.003
-60,0.21,0.003
-"""
-
-
-@pytest.fixture
-def folder(tmp_path: Path) -> Path:
-    (tmp_path / "slab.toml").write_text(STACK)
-    (tmp_path / "totals.csv").write_text(CSV)
-    return tmp_path
 
 
 def test_what_a_file_cannot_hold_is_refused(tmp_path: Path) -> None:
@@ -66,20 +44,20 @@ def test_a_fit_by_spheres_is_kept_and_reported(tmp_path: Path) -> None:
     assert "In the plane of incidence" not in page
 
 
-def test_on_the_command_line(folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch) -> None:
-    monkeypatch.chdir(folder)
+def test_on_the_command_line(work: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (work / "totals.csv").write_text("theta_i,total_reflectance,total_reflectance_sigma\n0,0.30,0.003\n60,0.21,0.003\n")
     assert main(["info", "totals.csv"]) == 0
     assert "shares of the incident flux" in capsys.readouterr().out
-    assert (folder / "totals.png").is_file()
-    assert main(["fit", "totals.csv", "--stack", "slab.toml", "--out", "result", "--starts", "1"]) == 0
+    assert (work / "totals.png").is_file()
+    assert main(["fit", "totals.csv", "--stack", "coat.toml", "--out", "result", "--starts", "1"]) == 0
     assert "layers[0].thickness" in capsys.readouterr().out
-    assert (folder / "result" / "report.html").is_file()
+    assert (work / "result" / "report.html").is_file()
     assert main(["convert", "totals.csv", "copy.csv"]) == 0
     np.testing.assert_array_equal(fits.read("copy.csv").values, fits.read("totals.csv").values)
     sphere = "200 25 12 1 0.96"
-    (folder / "slab.rxt").write_text(f"IAD1 1.4 1.5 2.0 1.0 5 0.98 1 {sphere} {sphere} 2 0.3 0.4\n")
+    (work / "slab.rxt").write_text(f"IAD1 1.4 1.5 2.0 1.0 5 0.98 1 {sphere} {sphere} 2 0.3 0.4\n")
     capsys.readouterr()
-    fit = ["fit", "totals.csv", "--stack", "slab.toml", "--out", "r"]
+    fit = ["fit", "totals.csv", "--stack", "coat.toml", "--out", "r"]
     for words, message in (
         ([*fit, "--select", "incidence=0"], "--select does not apply"),
         ([*fit, "--max-polar-angle", "50"], "--max-polar-angle does not apply"),
@@ -87,7 +65,7 @@ def test_on_the_command_line(folder: Path, capsys: pytest.CaptureFixture[str], m
         (["search", "totals.csv", "--out", "r"], "a search needs measurements along directions"),
         (["convert", "slab.rxt", "slab.csv"], "slab.rxt: integrating spheres"),
     ):
-        assert message in refused(words, capsys, folder)
+        assert message in refused(words, capsys, work)
 
 
 def test_many_channels_have_a_range(tmp_path: Path) -> None:

@@ -9,11 +9,10 @@ import pytest
 from scipy import special, stats
 
 import fits
-import layerjax as lj
 from fits.optimise.fit import fit
 from fits.optimise.result import Fit
 from fits.prediction.importance import importance_draws
-from fits.problem.parameters import Free, Normal
+from fits.problem.parameters import Free, Normal, Prior, Uniform
 from fits.reports import verdicts
 from fits.reports.tables import parameter_table, posterior_table
 from fits.sampling.convergence import Convergence
@@ -36,11 +35,14 @@ def pair(stack, wi, wo):
     return jnp.exp(-stack["p"] / wo[:, 2:]) + jnp.exp(-stack["q"] / wo[:, 2:])
 
 
+def pair_fit(prior: Prior) -> Fit:
+    stack = {"p": Free(0.5, 0.0, HIGH, prior), "q": Free(0.6, 0.0, HIGH)}
+    return fit(stack, DATA, transport=pair, starts=8)
+
+
 @pytest.fixture(scope="module", params=["alike", "with a prior"])
 def fitted(request: pytest.FixtureRequest) -> Fit:
-    prior = {} if request.param == "alike" else {"prior": Normal(0.3, NARROW)}
-    stack = {"p": Free(0.5, 0.0, HIGH, **prior), "q": Free(0.6, 0.0, HIGH)}
-    return fit(stack, DATA, transport=pair, starts=8)
+    return pair_fit(Uniform() if request.param == "alike" else Normal(0.3, NARROW))
 
 
 @pytest.fixture(scope="module")
@@ -63,8 +65,9 @@ def summed(fitted: Fit) -> tuple[float, float, float, float]:
     top = max(height.max() for _, height in parts)
     weights = [np.exp(height - top).sum(axis=1) for _, height in parts]
     total = sum(weight.sum() for weight in weights)
-    mean = sum(float(weight @ p) for (p, _), weight in zip(parts, weights, strict=True)) / total
-    square = sum(float(weight @ p**2) for (p, _), weight in zip(parts, weights, strict=True)) / total
+    mean, square = (
+        sum(float(weight @ p**power) for (p, _), weight in zip(parts, weights, strict=True)) / total for power in (1, 2)
+    )
     step = x[1] - x[0]
     return mean, math.sqrt(square - mean**2), float(weights[1].sum() / total), top + math.log(total * step**2)
 
@@ -72,17 +75,13 @@ def summed(fitted: Fit) -> tuple[float, float, float, float]:
 Sums = tuple[float, float, float, float]
 
 
-def test_the_evidence_is_that_of_all_modes(fitted: Fit, summed: Sums) -> None:
-    *_, log_evidence = summed
+def test_evidence_and_draws_by_weight_are_those_of_all_modes(fitted: Fit, summed: Sums) -> None:
+    """Predictions are made with such draws."""
+    *_, share, log_evidence = summed
     found = fits.evidence(fitted)
     assert found.reliable
     assert found.log_evidence == pytest.approx(log_evidence, abs=4.0 * found.error)
     assert found.error < 0.05  # one mode alone of two alike is 0.69 off
-
-
-def test_draws_by_weight_are_of_all_modes(fitted: Fit, summed: Sums) -> None:
-    """Those that predictions are made with."""
-    *_, share, _ = summed
     draws = importance_draws(fitted, 1000, np.random.RandomState(0)).resample(np.random.RandomState(1), 1000)
     larger = draws[:, 0] > special.logit(0.9 / HIGH)
     assert np.mean(larger) == pytest.approx(share, abs=4.0 * math.sqrt(share * (1.0 - share) / 500.0))
@@ -121,10 +120,9 @@ def test_errors_of_one_of_several_minima_are_said_to_be(fitted: Fit) -> None:
 
 
 def test_minima_that_hold_next_to_nothing_are_no_modes() -> None:
-    stack = {"p": Free(0.5, 0.0, HIGH, Normal(0.3, 0.25)), "q": Free(0.6, 0.0, HIGH)}
-    found = fit(stack, DATA, transport=pair, starts=8)  # the other is 11 lower in the log-posterior
+    found = pair_fit(Normal(0.3, 0.25))  # the other is 11 lower in the log-posterior
     assert len(found.minima) >= 2
-    assert initial_mixture(found).mode_count == 1
+    assert initial_mixture(found, 8).mode_count == 1
 
 
 def test_walkers_that_stay_where_they_are_have_not_converged() -> None:
@@ -150,29 +148,3 @@ def test_it_is_said_where_shares_of_modes_are_not_known(fitted: Fit) -> None:
     assert any("R-hat of at most 1.01 are needed" in line for line in lines)
     with pytest.raises(ValueError, match=r"with R-hat of at most 1.01 \(it is [1-9]"):
         posterior.summary()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("sampler", ["emcee", "nuts"])
-def test_two_metals_that_share_a_surface(sampler: Sampler) -> None:
-    """Whichever is called which: both have one mean, half of their sum, and a deviation of half their difference."""
-    if sampler == "nuts":
-        pytest.importorskip("blackjax")
-
-    def metal(alpha) -> lj.Stack:
-        return lj.Stack([], lj.Conductor(0.2, 3.0, alpha))
-
-    single, geometry = lj.SingleScattering(), fits.slices([20.0, 50.0], np.arange(-70.0, 71.0, 5.0))
-    data = fits.simulate(
-        lj.Mixture({"a": metal(0.12), "b": metal(0.4)}, [0.5, 0.5]), geometry, single, 0.03, 1e-4, seed=1
-    )
-    stack = lj.Mixture({name: metal(Free(start, 0.02, 1.0)) for name, start in (("a", 0.2), ("b", 0.3))}, [0.5, 0.5])
-    found = fits.fit(stack, data, transport=single, noise=fits.Noise(0.03, 1e-4, discrepancy=False), starts=8)
-    posterior = sample(found, sampler=sampler, seed=1)
-    assert posterior.converged
-    first, second = found.vector
-    error = 4.0 / math.sqrt(posterior.effective_samples.min())
-    for *_, mean, deviation in posterior.summary().values():
-        assert mean == pytest.approx(0.5 * (first + second), abs=error * 0.14)
-        assert deviation == pytest.approx(0.5 * abs(first - second), rel=error)
-    assert [mode.share for mode in posterior.modes] == [pytest.approx(0.5, abs=error)] * 2

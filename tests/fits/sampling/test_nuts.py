@@ -11,7 +11,7 @@ from fits.optimise.result import Fit
 from fits.reports.results import load_posterior, save_fit
 from fits.sampling.nuts import Nuts, _step
 from fits.sampling.posterior import Posterior
-from fits.sampling.sample import load, sample
+from fits.sampling.sample import load, sample, settings
 
 pytest.importorskip("blackjax")
 
@@ -63,30 +63,16 @@ def test_it_goes_on_from_its_file_to_the_same_end(result: Fit, short: Posterior,
     np.testing.assert_array_equal(sample(result, **SHORT, path=path).chain, short.chain)
     assert [entry.name for entry in tmp_path.iterdir()] == ["chain"]
     assert load(result, path).status == short.status
-
-
-def test_a_chain_of_another_sampler_is_refused(result: Fit, tmp_path: Path) -> None:
-    path = tmp_path / "chain"
-    sample(result, **SHORT, path=path)
     before = path.read_bytes()
     with pytest.raises(ValueError, match=r"another problem \(sampler nuts, not emcee"):
         sample(result, walkers=4 + 2, seed=1, path=path)
     assert path.read_bytes() == before
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"sampler": "gibbs"}, "sampler is 'gibbs'; it must be one of emcee, nuts"),
-        ({"sampler": "nuts", "walkers": 1}, "walkers is 1; it must be at least 2"),
-    ],
-)
-def test_refused(result: Fit, options: dict, message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        sample(result, **options)
-
-
-def test_without_its_extra_it_says_how_to_get_it(result: Fit, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_chains_and_extra_are_there(result: Fit, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert settings(20, "nuts").walkers == 4
+    with pytest.raises(ValueError, match="walkers is 1; it must be at least 2"):
+        sample(result, sampler="nuts", walkers=1)
     monkeypatch.setitem(sys.modules, "blackjax", None)
     with pytest.raises(ValueError, match=r'^sampler="nuts" needs blackjax: pip install "layerjax\[nuts\]"$'):
         sample(result, sampler="nuts")
@@ -107,4 +93,4 @@ def test_the_command_samples_with_it(
     assert posterior is not None
     assert posterior.chain.shape[:2] == (200, 4)
     assert main(["sample", "result", "--sampler", "emcee"]) == 2
-    assert "--sampler is emcee, the chain in result/chain.db has nuts" in capsys.readouterr().err
+    assert "(sampler nuts, not emcee, walkers 4, not 32)" in capsys.readouterr().err

@@ -17,6 +17,8 @@ SCALE = Free(1.0, 0.1, 10.0, LogUniform())
 ALBEDO = Free(0.5, 0.0, 1.0)
 PAINT = lj.Stack([], lj.Lambertian(ALBEDO))
 HAZE = lj.Stack([lj.Medium(Free(0.2, 0.0, 2.0), 0.8)], lj.Lambertian(ALBEDO))
+SHARES = np.array([0.1, 0.3, 0.5, 0.7, 0.9])
+ALBEDOS = LEVEL / 10.0 + (1.0 - LEVEL / 10.0) * SHARES  # uniform above the least albedo, at the largest scale
 SEEDS = [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(1, 6))]
 
 
@@ -32,21 +34,17 @@ def sampled(stack, seed):
     return posterior
 
 
-def shares_below(posterior, name, levels):
+def assert_quantiles(posterior, levels, name="base.albedo"):
+    """That these shares of the draws lie below; the product is known to half a per cent."""
     values = posterior.chain[posterior.burn_in :, :, posterior.names.index(name)].ravel()
     error = 1.0 / np.sqrt(posterior.effective_samples.min())
-    return np.mean(values[:, None] < levels, axis=0), error
+    np.testing.assert_allclose(np.mean(values[:, None] < levels, axis=0), SHARES, atol=4 * 0.5 * error + 0.005)
 
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_albedo_times_scale(seed):
     """Only the product is known: uniform in albedo and log scale, albedo is uniform as far as the scale goes."""
-    posterior = sampled(PAINT, seed)
-    low = LEVEL / 10.0  # of the albedo, at the largest scale
-    levels = low + (1.0 - low) * np.array([0.1, 0.3, 0.5, 0.7, 0.9])
-    found, error = shares_below(posterior, "base.albedo", levels)
-    # the product is known to half a per cent
-    np.testing.assert_allclose(found, [0.1, 0.3, 0.5, 0.7, 0.9], atol=4 * 0.5 * error + 0.005)
+    assert_quantiles(sampled(PAINT, seed), ALBEDOS)
 
 
 @pytest.mark.slow
@@ -56,9 +54,7 @@ def test_trajectories_jump_along_it_and_go_on_from_their_file(tmp_path):
     fitted = fit(PAINT, paint(0), scale=SCALE, transport=lj.SingleScattering(), starts=2)
     how = {"sampler": "nuts", "seed": 0, "allow_unconverged": True}
     posterior = sample(fitted, **how, max_steps=600)
-    levels = LEVEL / 10.0 + (1.0 - LEVEL / 10.0) * np.array([0.1, 0.3, 0.5, 0.7, 0.9])
-    found, error = shares_below(posterior, "base.albedo", levels)
-    np.testing.assert_allclose(found, [0.1, 0.3, 0.5, 0.7, 0.9], atol=4 * 0.5 * error + 0.005)
+    assert_quantiles(posterior, ALBEDOS)
     assert posterior.effective_samples.min() > 200  # of 2,400 steps; without jumps chains stay about where they began
     sample(fitted, **how, max_steps=200, path=tmp_path / "chain")
     longer = sample(fitted, **how, max_steps=600, path=tmp_path / "chain")
@@ -87,6 +83,4 @@ def test_haze_and_albedo_times_scale(seed):
     for axis, name, grid in ((0, "base.albedo", albedo), (1, "layers[0].thickness", thickness)):
         below = np.cumsum(density.sum(axis=axis))
         below /= below[-1]
-        levels = np.interp([0.1, 0.3, 0.5, 0.7, 0.9], below, grid + 0.5 * (grid[1] - grid[0]))
-        found, error = shares_below(posterior, name, levels)
-        np.testing.assert_allclose(found, [0.1, 0.3, 0.5, 0.7, 0.9], atol=4 * 0.5 * error + 0.005)
+        assert_quantiles(posterior, np.interp(SHARES, below, grid + 0.5 * (grid[1] - grid[0])), name)

@@ -7,11 +7,10 @@ import pytest
 
 from fits.optimise.fit import fit
 from fits.optimise.result import Fit
-from fits.problem.noise import Noise
 from fits.problem.parameters import Free
 from fits.sampling.posterior import Posterior
 from fits.sampling.sample import Sampler, sample
-from tests.helpers.models import COUNT, LINE, LOBE_STACK, design, line, line_data, lobe, measured, noisy_lobe
+from tests.helpers.models import COUNT, LINE, LOBE_STACK, design, line, line_data, lobe, noisy_lobe, student_fit
 
 pytest.importorskip("blackjax")
 
@@ -29,13 +28,7 @@ def on_a_bound() -> Fit:
     return fit({"a": Free(0.9, -1.0, 3.0), "b": Free(2.0, 0.52, 3.0)}, line_data(), transport=line, starts=2)
 
 
-def with_a_free_level() -> Fit:
-    """A line, the level of its noise, and tails of Student's."""
-    noise = Noise(relative=0.0, floor=Free(0.1, 1e-3, 1.0), tails="student")
-    return fit(LINE, measured(line_data().values), transport=line, noise=noise, starts=4)
-
-
-MADE = [pytest.param(made, marks=pytest.mark.slow) for made in (coated, on_a_bound, with_a_free_level)]
+MADE = [pytest.param(made, marks=pytest.mark.slow) for made in (coated, on_a_bound, student_fit)]
 
 
 @pytest.fixture(scope="module", params=MADE, ids=lambda made: made.__name__)

@@ -44,9 +44,9 @@ def test_columns_and_their_derivatives(axes: int) -> None:
     def columns(*places: jax.Array) -> jax.Array:
         return jnp.stack(read(table.ravel(), 0, COUNTS[:axes], places, COLUMNS, table[0].size))
 
-    values = columns(*map(jnp.asarray, places))
-    slopes = jax.vmap(jax.jacfwd(columns, argnums=tuple(range(axes))), 0, -1)(*map(jnp.asarray, places))
-    back = jax.vmap(jax.jacrev(columns, argnums=tuple(range(axes))), 0, -1)(*map(jnp.asarray, places))
+    modes = (mode(columns, argnums=tuple(range(axes))) for mode in (jax.jacfwd, jax.jacrev))
+    functions = [columns, *(jax.vmap(mode, 0, -1) for mode in modes)]
+    values, slopes, back = jax.jit(lambda *at: [function(*at) for function in functions])(*places)
     for c in range(COLUMNS):
         wanted = np.stack([by_scipy(table[c], at) for at in places.T], axis=-1)
         np.testing.assert_allclose(values[c], wanted[0], rtol=0.0, atol=1e-14)

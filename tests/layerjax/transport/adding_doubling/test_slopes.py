@@ -50,7 +50,7 @@ REVERSE = ("flakes", "haze on metal", "low coat on paint")
 """Whose gradients compile fast."""
 
 
-SHORT_ONES = ("flakes", "low coat on paint")
+SHORT_ONES = ("flakes",)
 """Whose programs do as well. Those of a hazy coat are compared with differences in `test_known_directions`, and light
 that passes a slab straight is in `test_ballistic`."""
 

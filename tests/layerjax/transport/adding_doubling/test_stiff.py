@@ -22,7 +22,7 @@ def missing(ior, alpha, below, thickness, g):
     return jnp.max(jnp.abs(reflected + transmitted - 1.0))
 
 
-@pytest.mark.parametrize("alpha", [1e-4, 0.3, *(pytest.param(n, marks=pytest.mark.slow) for n in (0.02, 0.1, 1.0))])
+@pytest.mark.parametrize("alpha", [0.3, *(pytest.param(n, marks=pytest.mark.slow) for n in (1e-4, 0.02, 0.1, 1.0))])
 def test_lossless_slabs_keep_their_energy(alpha):
     """Rounding alone is lost: 1e-12, and 3e-7 of the finest roughness next to an index of 1, where what is turned back
     is known to a table's rounding."""
