@@ -340,17 +340,17 @@ def _free(where: str, table: Any, allowed: Range = ANY) -> Free:
     for key in ("start", "low", "high"):
         if key not in table:
             raise ValueError(f"{where} has no {key}, a free parameter must have start, low and high")
-    given: dict[str, Any] = {}
+    settings: dict[str, Any] = {}
     for key, value in table.items():
         place = f"{where}.{key}"
         if key == "prior":
-            given[key] = _build(place, value, _PRIORS)
+            settings[key] = _build(place, value, _PRIORS)
         elif key == "same_for_all_texels":
-            given[key] = truth(place, value)
+            settings[key] = truth(place, value)
         else:
-            given[key] = numbers(place, value, ANY if key == "random_walk_sd" else allowed)
+            settings[key] = numbers(place, value, ANY if key == "random_walk_sd" else allowed)
     try:
-        return Free(**given)
+        return Free(**settings)
     except ValueError as error:
         raise ValueError(f"{where}: {str(error).replace('Free.', '')}") from None
 

@@ -115,7 +115,7 @@ def test_proposals_are_learned_from_the_chain(result: Fit) -> None:
     law = stats.multivariate_normal(initial.centre[0] + 6.0, [[0.5, 0.3], [0.3, 0.4]])
     chain = Chain(16, 2)
     chain.decide({"initial": initial.record()})
-    chain.chain, chain.iteration = law.rvs(1600, random_state=generator).reshape(100, 16, 2), 100
+    chain.chain, chain.iteration = law.rvs(3200, random_state=generator).reshape(200, 16, 2), 200
     learned, fresh = proposals_of(chain), law.rvs(4000, random_state=generator)
     assert 0.0 < np.mean(law.logpdf(fresh) - learned.log_density(fresh)) < 0.4
     assert np.mean(initial.log_density(learned.draw(generator, 1000)) > -20.0) == pytest.approx(0.1, abs=0.05)
@@ -149,7 +149,8 @@ def test_parameters_tied_together_on_one_bound() -> None:
 
 
 def test_a_short_chain_reports_nothing_unless_told_to(result: Fit, tmp_path: Path) -> None:
-    short = sample(result, walkers=16, seed=1, max_steps=100, path=tmp_path / "chain")
+    options = SamplerOptions(walkers=16, max_steps=100, autocorrelation_times=500.0)
+    short = sample(result, seed=1, options=options, path=tmp_path / "chain")
     assert not short.converged
     with pytest.raises(ValueError, match=r"chain of 100 steps is too short.*autocorrelation time.*larger max_steps"):
         short.summary()
