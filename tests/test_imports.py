@@ -81,6 +81,11 @@ def test_importing_fits_pays_for_nothing_unused():
     }
 
 
+def test_fitting_and_exporting_load_what_few_need_when_they_need_it():
+    unused = {"jaxopt", "arviz", "emcee", "h5py", "MaterialX", "matplotlib"}
+    assert not loaded_by("import fits.optimise.fit, fits.exports.export") & unused
+
+
 def test_public_names_are_there_and_no_modules():
     """Importing a module binds its name in its package: none may hide a function."""
     assert not {f"fits.{name}" for name in fits.__all__} & MODULES.keys()
