@@ -22,9 +22,6 @@ from fits.sampling.proposals import Density, FittedProposal, propose
 FITS = (25 * 1.5 ** np.arange(40.0)).astype(int)
 """Steps after which proposals are fitted again: often while the chain is short, seldom once it is long."""
 
-FEWEST = 1000
-"""Draws that a density is fitted to, at least: on a ridge one that is fitted to fewer is worse than the first."""
-
 DIFFERENCE = 1.2
 """Length of differential evolution, where 2.38 is best for a normal posterior: curved ones are narrower than they are
 long."""
@@ -71,14 +68,16 @@ class Ensemble:
         return emcee.State(positions, random_state=generator.get_state())  # else emcee copies numpy's global state
 
 
-def proposals_of(chain: Chain) -> Density:
+def proposals_of(chain: Chain, fewest: int = 1) -> Density:
     """What proposals are drawn from until the next fit: fitted to the second half of the chain up to the last one.
+
+    fewest: draws that they are fitted to, at least.
 
     As fits grow apart, so the adaptation fades; and a chain that is gone on with is the same, for it depends on whole
     fits only.
     """
     initial, last = Mixture(**chain.moves["initial"]), FITS[chain.iteration >= FITS].max(initial=0)
-    if (last - last // 2) * chain.shape[0] < FEWEST:
+    if (last - last // 2) * chain.shape[0] < fewest:
         return initial
     positions = chain.chain[last // 2 : last].reshape(-1, chain.shape[-1])
     with one_thread():  # the same to the last bit, whatever else runs

@@ -28,6 +28,7 @@ from fits.sampling.options import SamplerOptions
 from fits.sampling.proposals import propose
 
 CHAINS = 4
+FEWEST = 1000  # draws that proposals are fitted to: on a ridge those of fewer, by few chains, are worse than the first
 DRAWS = 4096  # of the approximation, for its covariance
 
 
@@ -64,12 +65,12 @@ class Nuts:
 
     def advance(self, step: int, show: Callable[[], None]) -> None:
         """Append steps to the chain until it has `step` of them, and `show` each."""
-        chain, moves, proposals = self.chain, self.chain.moves, proposals_of(self.chain)
+        chain, moves, proposals = self.chain, self.chain.moves, proposals_of(self.chain, FEWEST)
         positions = chain.get_last_sample().coords if chain.iteration else moves["positions"]
         chain.grow(step - chain.iteration, None)
         while chain.iteration < step:
             if chain.iteration in FITS:
-                proposals = proposals_of(chain)
+                proposals = proposals_of(chain, FEWEST)
             generator = np.random.RandomState([self.seed, chain.iteration])
             drawn, log_ratio = propose(proposals, positions, generator)
             gain = log_ratio + self._log_posteriors(drawn) - self._log_posteriors(positions)
