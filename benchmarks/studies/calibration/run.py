@@ -43,7 +43,7 @@ LEAST_THINNING = 5.0
 """Autocorrelation times after which draws of one walker count as independent."""
 
 TEXT = """\
-# Calibration of posteriors
+# Calibration of posteriors{kind}
 
 {environment}
 Simulation-based calibration (Talts, Betancourt, Simpson, Vehtari & Gelman 2018, arXiv:1804.06788): {repeats} truths
@@ -261,6 +261,7 @@ def _save(
             for one, value in case.free.items()
         ),
         name=case.name,
+        kind=": " * ("-" in case.name) + case.name.partition("-")[2],
         count=len(case.geometry),
         noise=case.noise,
         starts=STARTS,
