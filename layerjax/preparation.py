@@ -104,7 +104,7 @@ def prepared_for_energies(stack: Stack | Prepared, transport: Any, dtype: jnp.dt
     if not isinstance(stack, Prepared):
         require_numbers(stack)
         require_single(stack, "prepare")
-        chosen, simplified = chosen_for(stack, transport, lambda: None)
+        chosen, simplified = chosen_for(stack, transport, None)
         stack = Prepared(chosen.prepare_energies(simplified), chosen, channel_count(stack))
     return in_precision(stack, dtype)
 
@@ -118,15 +118,16 @@ def prepare_at(stack: Stack, transport: Any, known: Known) -> Prepared:
     return Prepared(chosen.prepare_for(simplified, known), chosen, channel_count(stack))
 
 
-def chosen_for(stack: Stack, transport: Any, known: Known) -> tuple[Transport, Stack]:
-    """The transport with nothing left open, and the simplified stack."""
+def chosen_for(stack: Stack, transport: Any, known: Known | None) -> tuple[Transport, Stack]:
+    """The transport with nothing left open, and the simplified stack; known is None: for energies."""
     require_numbers(stack)
     simplified, names = simplify_and_name(stack)
     chosen = automatic(stack, simplified) if isinstance(transport, str) and transport == "auto" else transport
     if not isinstance(chosen, Transport):
         raise ValueError(f'transport: {in_short(transport)} is not a Transport or "auto"{_meant(transport)}')
     chosen.check(simplified, names)
-    return chosen.chosen_for(simplified, known), simplified
+    chosen = chosen.chosen_for_energies(simplified) if known is None else chosen.chosen_for(simplified, known)
+    return chosen, simplified
 
 
 def _meant(transport: object) -> str:

@@ -72,6 +72,10 @@ class Transport(eqx.Module):
         """The same transport with all that it does not state chosen for the (simplified) stack and known directions."""
         return self
 
+    def chosen_for_energies(self, stack: Stack) -> "Transport":
+        """`chosen_for` energies alone, which no narrow lobe needs a finer resolution for."""
+        return self.chosen_for(stack, lambda: None)
+
     def prepare_for(self, stack: Stack, known: Known) -> Any:
         """`prepare` for values at known directions alone, for transports to which these are of use."""
         return self.prepare(stack)

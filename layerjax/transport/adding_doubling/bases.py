@@ -19,7 +19,8 @@ from layerjax.transport.adding_doubling.sampling import modes_at_nodes, projecte
 def base_layer(region: Region, base: Surface, modes: int, multiple: bool) -> Layer:
     """An opaque base under a region, as Fourier modes."""
     weight = projected_weight(region)
-    kernels = modes_at_nodes(base.evaluate, region, region, modes)
+    is_metal = isinstance(base, Conductor)
+    kernels = modes_at_nodes(base.evaluate, region, region, modes, has_mirror_lobe=is_metal)
     if isinstance(base, Conductor):
         return Layer(_conductor(region, base, kernels, multiple))
     return Layer(Parts(jnp.stack(kernels) * weight[:, None]))

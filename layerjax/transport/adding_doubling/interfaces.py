@@ -220,7 +220,7 @@ def _face(region: Region, energy: Array, ior: Array, normals: Normals, modes: in
         level = fresnel.dielectric(cosine, ior, _critical_blur(wi, wo, ior, np.pi / azimuths(modes), trapped_blur))
         return [level * mirror_lobe(h, wi, wo, *normals)]
 
-    return scaled_to_energy(region, modes_at_nodes(reflection, region, region, modes)[0], energy)
+    return scaled_to_energy(region, modes_at_nodes(reflection, region, region, modes, has_mirror_lobe=True)[0], energy)
 
 
 def _trapped_blur(grid: Grid, next_event: NextEvent) -> float:

@@ -211,6 +211,12 @@ class AddingDoubling(DeterministicTransport):
                 )
         return self._at(self._resolution(stack, directions is not None))
 
+    def chosen_for_energies(self, stack: Stack) -> "AddingDoubling":
+        """Lobes too narrow for the nodes are no shortage: each node sends their light to itself, as mirrors do."""
+        if self.tolerance is not None or any(map(is_tilted, stack.layers)) or shortage(stack, False) is None:
+            return self.chosen_for(stack, lambda: None)
+        return self._at(self._resolution(stack, False))
+
     def prepare(self, stack: Stack) -> Solved:
         first = first_order(stack)
         if not self._is_solved(stack):

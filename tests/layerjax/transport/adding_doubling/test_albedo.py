@@ -1,5 +1,6 @@
 """Directional albedo against quadrature of `evaluate` in the test, over lobes far narrower than nodes are apart."""
 
+import warnings
 from dataclasses import replace
 
 import jax
@@ -135,3 +136,31 @@ def test_albedo_of_many_channels_takes_little_memory():
 
     used = jax.jit(reflected).lower(jnp.linspace(0.5, 0.9, 100)).compile().memory_analysis()
     assert used.temp_size_in_bytes < 1e9
+
+
+def mirrors(cosine, ior, metal):
+    """Reflectance of a smooth coat on a smooth metal: a geometric series of Fresnel's reflectances."""
+
+    def fresnel(cosine, index):
+        inside = np.sqrt(1.0 - (1.0 - cosine**2) / index**2 + 0j)
+        parts = (
+            (cosine - index * inside) / (cosine + index * inside),
+            (index * cosine - inside) / (index * cosine + inside),
+        )
+        return sum(np.abs(part) ** 2 for part in parts) / 2.0
+
+    coat = fresnel(cosine, ior)
+    base = fresnel(np.sqrt(1.0 - (1.0 - cosine**2) / ior**2), metal / ior)
+    return coat + (1.0 - coat) ** 2 * base / (1.0 - coat * base)
+
+
+@pytest.mark.parametrize("alpha", [1e-4, pytest.param(1e-3, marks=pytest.mark.slow)])
+def test_albedo_of_a_coated_mirror_up_to_grazing_light(alpha):
+    """A tenth had been lost at 80 degrees: a node next to the critical angle sent light past it. Without a warning."""
+    theta = np.radians([0.0, 40.0, 60.0, 75.0, 80.0])
+    stack = lj.Stack([lj.Interface(1.5, alpha)], lj.Conductor(0.2, 3.5, alpha))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        found = lj.albedo(stack, lj.direction(theta, 0.0))[0][:, 0]
+    masked = 10.0 * alpha  # what masking takes of light that leaves at 80 degrees, and less elsewhere
+    np.testing.assert_allclose(found, mirrors(np.cos(theta), 1.5, 0.2 + 3.5j), rtol=5e-4 + masked)
