@@ -8,6 +8,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, Literal, get_args
 
+import jax.numpy as jnp
 import numpy as np
 from scipy.special import logit
 from scipy.stats import qmc
@@ -184,6 +185,7 @@ def identity_of(problem: Problem, walkers: int, seed: int, sampler: str = "emcee
         sampler=sampler,
         walkers=walkers,
         seed=seed,
+        precision=str(jnp.zeros(()).dtype),
         names=list(problem.names),
         bounds=[f"{bound:.9g}" for bound in np.concatenate([problem.low, problem.high])],
         posterior=[f"{height:.6g}" for height in log_posterior],

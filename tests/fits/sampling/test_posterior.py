@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import emcee
+import jax
 import numpy as np
 import pytest
 from scipy import stats
@@ -217,6 +218,7 @@ def _stored_steps(path: Path) -> int:
     return sum(len(block["coords"]) for block in Store.read(path).all("steps")) if path.exists() else 0
 
 
+@pytest.mark.filterwarnings("ignore:Explicitly requested dtype float64")
 def test_a_chain_of_something_else_is_refused(result: Fit, tmp_path: Path) -> None:
     path = tmp_path / "chain"
     sample(result, walkers=16, seed=1, max_steps=100, path=path)
@@ -228,6 +230,8 @@ def test_a_chain_of_something_else_is_refused(result: Fit, tmp_path: Path) -> No
     ):
         with pytest.raises(ValueError, match=re.escape(words)):
             sample(one, walkers=walkers, seed=seed, path=path)
+    with jax.enable_x64(False), pytest.raises(ValueError, match="precision float64, not float32"):
+        load(result, path)
     assert len(sample(other, walkers=16, seed=2, path=path, resume=False, max_steps=100).chain) == 100
     path.write_bytes(b"not SQLite")
     with pytest.raises(ValueError, match="no store of this version"):

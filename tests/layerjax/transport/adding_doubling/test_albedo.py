@@ -164,3 +164,15 @@ def test_albedo_of_a_coated_mirror_up_to_grazing_light(alpha):
         found = lj.albedo(stack, lj.direction(theta, 0.0))[0][:, 0]
     masked = 10.0 * alpha  # what masking takes of light that leaves at 80 degrees, and less elsewhere
     np.testing.assert_allclose(found, mirrors(np.cos(theta), 1.5, 0.2 + 3.5j), rtol=5e-4 + masked)
+
+
+@pytest.mark.slow
+def test_smooth_faces_of_a_cuvette_need_one_mode_and_no_warning():
+    """As slabs of a sphere's readings have them: 48 nodes and 64 modes were taken, with a warning."""
+    wi = lj.direction(np.radians([8.0, 40.0]), 0.0)
+    milk = lj.Medium(5.0, 0.99, lj.HenyeyGreenstein(0.9))
+    stack = lj.Stack([lj.Interface(1.41, 1e-4), milk, lj.Interface(1.0, 1e-4)])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        found = lj.albedo(stack, wi)
+    np.testing.assert_allclose(found, lj.albedo(stack, wi, transport=lj.AddingDoubling(nodes=32, modes=1)), rtol=1e-3)
