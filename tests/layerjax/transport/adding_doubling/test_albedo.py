@@ -162,8 +162,9 @@ def test_albedo_of_a_coated_mirror_up_to_grazing_light(alpha):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         found = lj.albedo(stack, lj.direction(theta, 0.0))[0][:, 0]
-    masked = 10.0 * alpha  # what masking takes of light that leaves at 80 degrees, and less elsewhere
-    np.testing.assert_allclose(found, mirrors(np.cos(theta), 1.5, 0.2 + 3.5j), rtol=5e-4 + masked)
+    masked = alpha * np.array([0.5, 0.5, 0.5, 3.0, 10.0])  # by a walk, of what facets shadow and mirrors do not
+    expected = mirrors(np.cos(theta), 1.5, 0.2 + 3.5j)
+    np.testing.assert_array_less(np.abs(found / expected - 1.0), 5e-4 + masked)
 
 
 @pytest.mark.slow
