@@ -7,10 +7,8 @@ predicts better beyond its error nor has a clearly lower BIC: with model discrep
 predict as well as one that lacks one.
 """
 
-import html
 import math
 import re
-import time
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
@@ -24,7 +22,7 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 
 import layerjax as lj
-from fits._files import given_path, write_text
+from fits._files import given_path
 from fits._files import named as errors_named
 from fits.data.measurements import TO_HAVE_THEM, Measurements
 from fits.optimise.fit import fit as run_fit
@@ -41,17 +39,15 @@ from fits.problem.parameters import Free, LogUniform
 from fits.problem.problem import Problem
 from fits.problem.stack_file import check_keys, read_tables, require_table, stack_from_dict
 from fits.progress import Progress, given_progress
-from fits.reports.html import source_name
-from fits.reports.pages import Table, document, section
+from fits.reports.pages import Table
 from fits.reports.results import load_fit, save_fit
-from fits.reports.tables import parameter_table
 from fits.reports.verdicts import listed, verdict
 from fits.store import Store, fingerprint, holds_other_files
 from layerjax._checks import in_short, require_count, require_kind, require_seed
 from layerjax._numerics import broadcasting
 from layerjax.compiling import programs_kept
 
-STORE, PAGE = "search.store", "search.html"
+STORE = "search.store"
 TOGETHER = 8
 """Structures at a time, at most: as many programs as a process can hold beside those that it has."""
 
@@ -170,8 +166,6 @@ class SearchOptions:
         beam: so many stacks of the lowest BIC grow and shrink, and the one that predicts best.
         cross_validated: so many of a level, those of its lowest BIC, are cross-validated.
         bic_gain: a level that does not predict better is followed by another if it lowers the BIC by more than this.
-        budget: minutes after which no stack is begun any more, but those that a result needs; what was begun is
-            finished. None: without end.
         fit: tolerances and thresholds of each fit, of which some decide on a model discrepancy.
     """
 
@@ -180,7 +174,6 @@ class SearchOptions:
     beam: int = 2
     cross_validated: int = 3
     bic_gain: float = 10.0
-    budget: float | None = None
     fit: FitOptions = DEFAULT
 
     def __post_init__(self) -> None:
@@ -191,12 +184,8 @@ class SearchOptions:
             number = getattr(self, name)
             if not (isinstance(number, int) and low <= number <= high):
                 raise ValueError(f"{name} is {in_short(number)}; it must be a whole number in [{low}, {high}]")
-        for name in ("bic_gain", "budget"):
-            number = getattr(self, name)
-            if (name, number) != ("budget", None) and not (
-                isinstance(number, Real) and 0.0 <= float(number) < math.inf
-            ):
-                raise ValueError(f"{name} is {in_short(number)}; it must be a finite number of at least 0")
+        if not (isinstance(self.bic_gain, Real) and 0.0 <= float(self.bic_gain) < math.inf):
+            raise ValueError(f"bic_gain is {in_short(self.bic_gain)}; it must be a finite number of at least 0")
         require_kind("fit", self.fit, FitOptions)
 
 
@@ -231,12 +220,10 @@ class Search:
     Attributes:
         candidates: all stacks that were fitted, best first: by predictive score, then by BIC.
         options: of the search.
-        stopped: whether its budget ended it before it was done.
     """
 
     candidates: tuple[Candidate, ...]
     options: SearchOptions = SearchOptions()
-    stopped: bool = False
 
     @property
     def best(self) -> Candidate:
@@ -282,8 +269,8 @@ def search(
         transport, noise, scale, instrument: see `Problem`; "auto" carries all orders of scattering.
         seed: of the starts, see `fit`.
         options: how far the search goes.
-        directory: keeps every fit, and every incidence of a cross-validation, as it is finished: a search that was
-            killed, or whose budget ended it, is resumed there. The fits are result directories.
+        directory: keeps every fit and every cross-validation as it is finished: a search that was killed, or that ended
+            with fewer layers, is resumed there. The fits are result directories.
         progress: called with (what is done, structures done, structures of this level, note).
 
     Raises:
@@ -299,7 +286,6 @@ def search(
     require_seed(seed)
     library, options = library or default_library(len(data.channels)), options or SearchOptions()
     settings = {"transport": transport, "noise": noise or Noise(), "scale": scale, "instrument": instrument}
-    until = math.inf if options.budget is None else time.monotonic() + 60.0 * options.budget
     store: Any = nullcontext()
     if directory is not None:
         directory, used = given_path("directory", directory), data.used()
@@ -312,23 +298,17 @@ def search(
         numbers = [used.wi, used.wo, used.values, used.sigma]
         store = Store.open(directory / STORE, fingerprint(data=numbers, library=library, **settings, **starting))
     with store as opened:
-        work = _Work(data, library, settings, options, seed, opened, until, given_progress(progress))
+        work = _Work(data, library, settings, options, seed, opened, given_progress(progress))
         coarse: dict[Structure, Fit] = {}
         full: dict[Structure, _CrossValidated] = {}
         level: list[Structure] = [(base,) for base in library.bases]
-        stopped = False
-        while level and not stopped:
+        while level:
             leader, lowest = _ranked(full)[:1], min(map(_bic, coarse.values()), default=math.inf)
-            if leader and time.monotonic() > until:
-                stopped = True
-                break
             # every structure of the level with independent noise, at a coarse resolution
             coarse |= work.in_parallel(f"{len(level[0]) - 1} layers", work.fit_coarsely, level)
-            fitted = sorted((one for one in level if one in coarse), key=lambda one: _bic(coarse[one]))
             # those of the lowest BIC as `fits.fit` fits them, cross-validated
-            best_of_level = fitted[: options.cross_validated]
+            best_of_level = sorted(level, key=lambda one: _bic(coarse[one]))[: options.cross_validated]
             full |= work.in_parallel("cross-validation", partial(work.cross_validate, coarse), best_of_level)
-            stopped = len(fitted) < len(level) or any(one not in full for one in best_of_level)
             # a level that neither predicts better nor lowers the BIC clearly is the last
             ahead = not leader or _scores(full)[named(leader[0])].clear_diff > 0.0
             if not ahead and not min(map(_bic, coarse.values())) < lowest - options.bic_gain:
@@ -345,7 +325,7 @@ def search(
         fit = full[structure].fit if structure in full else coarse[structure]
         above = bic[structure] - min(bic.values())
         candidates.append(Candidate(structure, len(fit.vector), above, fit, scores.get(named(structure))))
-    return Search(tuple(candidates), options, stopped)
+    return Search(tuple(candidates), options)
 
 
 class _CrossValidated(NamedTuple):
@@ -365,7 +345,6 @@ class _Work(NamedTuple):
     options: SearchOptions
     seed: int
     store: Store | None
-    until: float
     progress: Progress
 
     def fit_coarsely(self, structure: Structure) -> Fit:
@@ -392,18 +371,10 @@ class _Work(NamedTuple):
             checked = record["cross-validation"]
             checked |= {"groups": tuple(checked["groups"]), "rows": tuple(checked["rows"])}
             return _CrossValidated(fit, CrossValidation(**checked), Evidence(**record["evidence"]))
-        result = _CrossValidated(fit, *out_of_sample(fit, checkpoint=partial(self._by_incidence, key)))
+        result = _CrossValidated(fit, *out_of_sample(fit))
         if self.store is not None:
             self.store.put(key, {"cross-validation": vars(result.checked), "evidence": vars(result.evidence)})
         return result
-
-    def _by_incidence(self, structure: str, incidence: str, compute: Callable[[], Any]) -> Any:
-        """The record of a held-out incidence, from the store if it is there."""
-        if self.store is None:
-            return compute()
-        if (record := self.store.get(key := f"{structure}, without {incidence}")) is None:
-            self.store.put(key, record := compute())
-        return record
 
     def _problem(self, structure: Structure, independent: bool = False) -> Problem:
         problem = Problem(self.library.stack(structure), self.data, **self.settings)
@@ -426,16 +397,12 @@ class _Work(NamedTuple):
     def in_parallel(
         self, stage: str, call: Callable[[Structure], Result], structures: list[Structure]
     ) -> dict[Structure, Result]:
-        """What the call gives by structure: of the first few whatever the time, of the others while there is any.
-
-        Several run at a time, since compiling one keeps a single core busy; none runs while programs are thrown away.
-        """
+        """What the call gives by structure. Several run at a time, since compiling one keeps a single core busy; none
+        runs while programs are thrown away."""
         several, results = min(cores(), TOGETHER), dict[Structure, Result]()
         self.progress(stage, 0, len(structures), named(structures[0]))
         with ThreadPoolExecutor(several) as pool:
             for first in range(0, len(structures), several):
-                if first and time.monotonic() > self.until:
-                    break
                 make_room()
                 some = structures[first : first + several]
                 for structure, result in zip(some, pool.map(broadcasting(call), some), strict=True):
@@ -475,18 +442,6 @@ def _scores(full: Mapping[Structure, _CrossValidated]) -> dict[str, ModelScore]:
 # ---- what it found ----
 
 
-def write_report(search: Search, directory: str | Path) -> None:
-    """Write the page into the directory of a search."""
-    title = f"Stacks behind {source_name(search.best.fit.problem.data)}"
-    body = [
-        f"<h1>{html.escape(title)}</h1>",
-        section("What the data say", search_sentences(search)),
-        section("Structures", search_table(search)),
-        section("The best", parameter_table(search.best.fit)),
-    ]
-    write_text(Path(directory) / PAGE, document(title, body), force=True)
-
-
 def search_table(search: Search, most: int | None = None) -> Table:
     """A row for each structure, best first."""
     rows = []
@@ -502,7 +457,7 @@ def search_table(search: Search, most: int | None = None) -> Table:
     hidden = len(search.candidates) - len(rows)
     note = (
         "First the cross-validated models, by elpd (sum of log predictive densities of held-out data); then the "
-        "others, by BIC with independent noise." + (f" {hidden} more are in the report." if hidden else "")
+        "others, by BIC with independent noise." + (f" There are {hidden} more." if hidden else "")
     )
     heads = ("from the top", "parameters", "chi2/dof", "BIC - best", "elpd", "elpd_diff ± dse", "weight", "probability")
     return Table("Stacks", heads, tuple(rows), note)
@@ -525,6 +480,4 @@ def search_sentences(search: Search) -> list[str]:
     words += [" ".join(best.sentences), *best.remarks]
     if unsure := [name for name, score in scores.items() if not score.evidence.reliable]:
         words.append(f"Probabilities are unreliable for {listed(unsure)}.")
-    if search.stopped:
-        words.append("The time budget ended the search before all models were tried. The same command resumes it.")
     return words

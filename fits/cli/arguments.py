@@ -90,7 +90,7 @@ OPTIONS: dict[str, Settings] = {
         "relative noise beside the file's sigma (default: 0.05 without one)", "REL", type=_number(float, 0.0, 1.0)
     ),
     "--scale-sd": _one("relative standard deviation of the global scale (default: 0)", "SD", type=level),
-    "--processes": _one("worker processes (default: one a core)", "N", type=count),
+    "--processes": _one("worker processes (default: threads of a single one)", "N", type=count, default=1),
     "--scheduler": _one(
         "in place of --processes: dask.distributed cluster that sees the files, such as tcp://...:8786", "ADDRESS"
     ),
@@ -214,11 +214,6 @@ COMMANDS = {
         {
             "data": _one(DATA, "DATA"),
             "--out": _out("DIR", "directory to write, or to resume"),
-            "--budget": _one(
-                "begin no stack after this time, and report what was found; the same command resumes (default: none)",
-                "MINUTES",
-                type=level,
-            ),
             "--layers": _one("most layers over the base (default: 3)", "N", type=int, default=3),
             "--instrument": _one("a file with an [instrument], such as a stack file", "TOML"),
         },
@@ -231,9 +226,8 @@ COMMANDS = {
             "data": _several("measurements, see docs/formats.md", "FOLDER|FILE"),
             "--stacks": _several("stacks, with their free parameters", "TOML"),
             "--out": _out("DIR", "directory to write, or to resume: DIR/FILE/STACK is a result"),
-            "--search": _flag("search for the stack behind each file as well"),
         },
-        f"--library --noise --scale-sd --processes --scheduler --starts {_READ} --select --hold-out --force",
+        f"--processes --scheduler --starts {_READ} --select --hold-out --force",
         {"--force": {"help": "fit again where stack, settings or the content of the file have changed"}},
     ),
     "info": Command(

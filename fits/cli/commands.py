@@ -201,60 +201,47 @@ def search(arguments: Namespace) -> int:
     from fits import structure_search
 
     directory = Path(arguments.out)
-    settings = _search_settings(arguments, layers=arguments.layers, budget=arguments.budget)
+    from fits.problem.noise import Noise
+    from fits.problem.parameters import Free, LogNormal
+    from fits.problem.stack_file import read_instrument
+
+    sd = arguments.scale_sd or 0.0
+    bound = float(np.exp(4.0 * sd))
+    settings: dict[str, Any] = {
+        "library": None if arguments.library is None else structure_search.read_library(arguments.library),
+        "noise": Noise() if arguments.noise is None else Noise(relative=arguments.noise),
+        "scale": Free(1.0, 1.0 / bound, bound, LogNormal(1.0, sd)) if sd > 0.0 else None,
+        "instrument": None if arguments.instrument is None else read_instrument(arguments.instrument),
+        "options": structure_search.SearchOptions(layers=arguments.layers),
+    }
     with show_progress() as progress, hint(f"{directory} {RESUME}"):
         found = structure_search.search(data, **settings, directory=directory, progress=progress)
-        structure_search.write_report(found, directory)
-    table, words = structure_search.search_table(found, 20), structure_search.search_sentences(found)
-    show(table, *words, f"Report: {directory / structure_search.PAGE}")
+    show(structure_search.search_table(found, 20), *structure_search.search_sentences(found), f"Fits: {directory}")
     return DONE
 
 
 RESUME = "keeps what was fitted; the same command resumes it"
 
 
-def _search_settings(arguments: Namespace, **options: Any) -> dict[str, Any]:
-    """Arguments of `fits.search` from the options of a search; options: further ones of `SearchOptions`."""
-    from fits.problem.noise import Noise
-    from fits.problem.parameters import Free, LogNormal
-    from fits.problem.stack_file import read_instrument
-    from fits.structure_search import SearchOptions, read_library
-
-    sd = arguments.scale_sd or 0.0
-    bound, instrument = float(np.exp(4.0 * sd)), getattr(arguments, "instrument", None)
-    return {
-        "library": None if arguments.library is None else read_library(arguments.library),
-        "noise": Noise() if arguments.noise is None else Noise(relative=arguments.noise),
-        "scale": Free(1.0, 1.0 / bound, bound, LogNormal(1.0, sd)) if sd > 0.0 else None,
-        "instrument": None if instrument is None else read_instrument(instrument),
-        "options": SearchOptions(**options),
-    }
-
-
 def fit_many(arguments: Namespace) -> int:
-    """Fit every file by every stack, print the outcomes, and write the table and its page."""
+    """Fit every file by every stack, print the outcomes, and write the table."""
     use_jax()
     from fits import batch
-    from fits.problem.compilation import cores
 
-    if not arguments.search:
-        refuse_alone(arguments, ("library", "noise", "scale_sd"), "search: a stack file states it")
     out = Path(arguments.out)
     with show_progress() as progress, hint(f"{out} {RESUME}"):
         found = batch.fit_files(
             arguments.data,
             arguments.stacks,
             out,
-            processes=arguments.processes or cores(),
+            processes=arguments.processes,
             client=arguments.scheduler,
-            search=_search_settings(arguments) if arguments.search else False,
             read_options=read_options(arguments),
             starts=arguments.starts,
             force=arguments.force,
             progress=progress,
         )
-    table, words = batch.overview(found.rows, 40), batch.statements(found)
-    show(table, *words, f"Table: {out / batch.TABLE}", f"Report: {out / batch.PAGE}")
+    show(batch.overview(found.rows, 40), *batch.statements(found), f"Table: {out / batch.TABLE}")
     return DONE if found.complete else DOUBTFUL
 
 

@@ -22,7 +22,7 @@ def use_jax() -> None:
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     import jax
 
-    from fits.engines.worker import quieten
+    from fits.engines import quieten
     from fits.problem.compilation import devices_of_cores
     from layerjax.compiling import keep_programs
 

@@ -21,7 +21,6 @@ def fit_map(arguments: Namespace) -> int:
         raise ValueError(f"{arguments.out}: there is no directory {Path(arguments.out).parent}")
     from fits.maps.inputs import map_data
     from fits.maps.options import MapOptions, SpatialPrior
-    from fits.problem.compilation import cores
 
     # before anything slow: what is wrong with the files is refused
     map_data(arguments.data, arguments.geometry, arguments.sigma, arguments.mask)
@@ -61,7 +60,7 @@ def fit_map(arguments: Namespace) -> int:
                 },
                 emulator=EMULATOR[arguments.emulator],
                 spatial_prior=prior,
-                processes=(arguments.processes or cores()) if arguments.scheduler is None else 1,
+                processes=arguments.processes,
                 progress=progress,
             ),
         )

@@ -16,7 +16,7 @@ from io import TextIOWrapper
 from typing import Any
 
 from fits.cli.arguments import build_parser
-from fits.engines.failures import one_line
+from fits.engines import one_line
 
 MAX_MESSAGE = 1000
 """Characters of an error that are shown: JAX adds a table of all arrays to one of memory."""

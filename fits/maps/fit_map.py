@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 import layerjax as lj
 from fits._files import given_path, locked
 from fits.data.geometry import direction
-from fits.engines import Failure, connected, run
-from fits.engines.processes import end_repeated_script
+from fits.engines import Failure, connected, end_repeated_script, run
 from fits.maps.inputs import Block, MapData, Measured, block_words, map_data
 from fits.maps.options import DEFAULT, VERDICTS, MapOptions
 from fits.maps.pilot import Job, assemble, fit_pilot, make_prototype, pilot_texels
@@ -90,7 +89,7 @@ def fit_map(
     path = out.resolve() if out.is_symlink() else out  # one lock for all links to a store
     if not path.resolve().parent.is_dir():
         raise ValueError(f"{path}: there is no directory {path.parent}")
-    with locked(Path(f"{path}.lock"), str(path)), connected(client) as connection:
+    with locked(Path(f"{path}.lock"), str(path)), connected(client, options.processes) as connection:
         return _fit(path, data, stack, noise, transport, replace(options, chunk_size=size), connection)
 
 
@@ -125,7 +124,7 @@ def _fit(
     pilot = assemble(problem, data.geometry is None, kept[0], store.attributes, options)
 
     # 3. all chunks
-    is_sent = not data.in_file and (client is not None or options.processes > 1)
+    is_sent = not data.in_file and client is not None
     job = Job(str(path.resolve()), pilot, replace(options, progress=None), None if is_sent else data)
     if failures := _fit_chunks(store, job, data, client, options):
         named = [*failures[:NAMED], *([f"and {len(failures) - NAMED} more"] if len(failures) > NAMED else [])]
@@ -183,7 +182,7 @@ def _fit_chunks(store: Store, job: Job, data: MapData, client: Any, options: Map
     total = sum(1 for _ in blocks_of(store.shape, store.chunk))
     done, poor, fitted = total - len(blocks), 0, 0
     options.report("map", done, total)
-    for index, result in run(work, job, tasks, processes=options.processes, client=client):
+    for index, result in run(work, job, tasks, client=client):
         if isinstance(result, Failure):
             failures.append(f"chunk {block_words(tasks[index][0])}: {result.error}")
         else:

@@ -23,7 +23,7 @@ from xarray.core import indexing
 from fits._files import require_there
 from fits.data.formats.csv import read_directions
 from fits.data.geometry import Floats, Geometry, Pairs, direction
-from fits.engines.failures import one_line
+from fits.engines import one_line
 from fits.store import fingerprint
 
 Block = tuple[slice, ...]

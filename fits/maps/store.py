@@ -24,7 +24,7 @@ from zarr.core.sync import sync
 
 from fits._files import given_path, named, plain, require_there
 from fits._lazy import shown_by
-from fits.engines.failures import one_line
+from fits.engines import one_line
 from fits.maps.inputs import UNREADABLE, Block
 from fits.store import another, differences
 

@@ -3,7 +3,6 @@
 import csv
 import shutil
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 from scipy import stats
@@ -14,7 +13,6 @@ from fits._files import locked
 from fits.batch import STORE
 from fits.data.reading import ReadOptions
 from fits.reports.html import FitReport
-from fits.structure_search import SearchOptions
 from tests.helpers.coats import TRUE, make_folder
 from tests.helpers.files import contents
 
@@ -105,11 +103,6 @@ def test_every_file_is_fitted_by_every_stack(whole, counted, monkeypatch):
     assert [line["layers[0].thickness"] != "" for line in lines[4:]] == [True, False]
     assert [line["standing"] for line in lines[:3]] == ["", "", "best"]
     assert lines[3]["standing"].startswith("+")
-    page = Path("out/report.html").read_text()
-    for word in ("coated.csv/coat/report.html", "paint.csv/bare/report.html", "twenty", "README.md"):
-        assert word in page
-    for link in {part.split('"')[0] for part in page.split('href="')[1:]}:
-        assert (whole / "out" / link).is_file()
 
 
 @pytest.mark.parametrize("late", [False, True], ids=["between", "before the row is kept"])
@@ -204,31 +197,6 @@ def test_held_out_data_decide(folder):
     assert coat["loss"] == pytest.approx(-2.0 * scores.elpd * scores.count, abs=2e-3 * scores.count)
 
 
-def test_the_best_of_a_search_is_a_result_like_others(folder, coat_fit, counted, monkeypatch):
-    searched = []
-
-    def search(data, *, directory, seed, options):
-        searched.append(directory.relative_to(folder))
-        assert (seed, options.layers) == (0, 1)
-        return SimpleNamespace(best=SimpleNamespace(name="haze / diffuse", fit=coat_fit))
-
-    monkeypatch.setattr(batch, "run_search", search)
-    monkeypatch.setattr(batch, "write_search", lambda *_: None)
-    looked = {"search": {"options": SearchOptions(layers=1)}, **FEW}
-    found = fits.fit_files(["scans/paint.csv", "scans/broken.csv"], ["bare.toml"], "out", **looked)
-    assert [(row["stack"], row.get("structure", ""), row["result"] == "failed") for row in found.rows] == [
-        ("bare", "", False),
-        ("search", "haze / diffuse", False),
-        ("bare", "", True),
-        ("search", "", True),
-    ]
-    assert fits.load_fit("out/paint.csv/search").values == pytest.approx(coat_fit.values)
-    fits.fit_files("scans/paint.csv", [], "out", **looked)
-    assert searched == [Path("out/paint.csv/search-stacks")]
-    with pytest.raises(ValueError, match=r"search: holds the work of another problem \(options\)"):
-        fits.fit_files("scans/paint.csv", [], "out", search=True)
-
-
 def test_processes_give_what_threads_give(folder, whole):
     """A worker knows nothing of the patches here: reports are drawn, where they are wanted."""
     for reports, out in ((True, "out"), (False, "plain")):
@@ -237,7 +205,6 @@ def test_processes_give_what_threads_give(folder, whole):
         albedo = fits.load_fit(whole / "out" / "paint.csv" / "bare").values["base.albedo"]
         assert found.rows[0]["base.albedo"] == pytest.approx(albedo, rel=1e-6)
         assert [row["result"] == "failed" for row in found.rows] == [False, True][: 1 + reports]
-        assert ("href=" in Path(out, "report.html").read_text()) == reports
     assert "data:image/png" in Path("out/paint.csv/bare/report.html").read_text()
     assert not list(folder.glob("plain/*/*/report.html"))
 
@@ -268,13 +235,12 @@ def test_what_goes_wrong_in_one_fit_ends_none_of_the_others(folder, counted, mon
     ("files", "stacks", "out", "message"),
     [
         (["nowhere"], STACKS, "out", "no such file or folder: 'nowhere'"),
-        (["empty"], STACKS, "out", "empty: holds no measurement file"),
-        ([], STACKS, "out", "no file is given"),
-        (["scans"], [], "out", "neither a stack nor a search is given"),
+        (["empty"], STACKS, "out", "empty: no measurement file is given"),
+        (["scans"], [], "out", "no stack is given"),
         (["scans/broken.csv"], STACKS, "out", "no file can be fitted: .*twenty"),
         (["scans", "copies"], STACKS, "out", r"scans/paint.csv and copies/paint.csv: results go by this name"),
         (["scans"], ["coat.toml", "copies/coat.toml"], "out", "results go by this name"),
-        (["scans"], ["search.toml"], "out", r"search.toml: its name must be another"),
+        (["scans"], ["table.csv.toml"], "out", r"table.csv and table.csv.toml: results go by this name"),
         (["scans"], STACKS, "scans", "is not empty, and holds no fits"),
         (["scans"], STACKS, "coat.toml", "is a file"),
         (["scans"], STACKS, "no/such", "there is no directory"),
@@ -283,7 +249,7 @@ def test_what_goes_wrong_in_one_fit_ends_none_of_the_others(folder, counted, mon
 def test_bad_input_is_named_and_writes_nothing(folder, files, stacks, out, message):
     for name in ("empty", "copies"):
         (folder / name).mkdir()
-    for name in ("search.toml", "copies/coat.toml"):
+    for name in ("table.csv.toml", "copies/coat.toml"):
         shutil.copy(folder / "bare.toml", folder / name)
     shutil.copy(folder / "scans" / "paint.csv", folder / "copies" / "paint.csv")
     before = contents(folder)
@@ -307,19 +273,9 @@ FAILED = {"file": "a.csv", "stack": "two", "result": "failed", "status": "unread
 @pytest.mark.parametrize(
     ("rows", "words"),
     [
-        # the lowest criterion is best, and what chance explains as good
-        ([row("one", 10.0), row("two", 11.9), row("three", 15.0)], ["best", "as good", "+5.0"]),
-        # scatter that the best leaves counts as noise
-        ([row("1", 10.0, reduced_chi_square=4.0), row("2", 17.0), row("3", 90.0)], ["best", "as good", "+20.0"]),
-        # of held-out data it does not
-        (
-            [row(name, loss, criterion="-2 elpd", reduced_chi_square=4.0) for name, loss in ("a9", "b1")],
-            ["+8.0", "best"],
-        ),
+        ([row("one", 10.0), row("two", 11.9), row("three", 15.0)], ["best", "+1.9", "+5.0"]),
         # what did not converge is not the best of what did
         ([row("one", 10.0, result="not converged"), row("two", 17.0)], ["-7.0", "best"]),
-        # named objectives of one kind are ranked without a verdict on chance
-        ([row("one", 1.0, criterion="cube_root"), row("two", 1.5, criterion="cube_root")], ["best", "+0.5"]),
         # nothing is said of what cannot be compared
         ([row("one", 10.0)], [""]),
         ([row("one", 10.0), FAILED], ["", ""]),
@@ -327,30 +283,14 @@ FAILED = {"file": "a.csv", "stack": "two", "result": "failed", "status": "unread
     ],
 )
 def test_stacks_of_a_file_are_ranked(rows, words):
-    rows = [one | ({"loss": float(one["loss"])} if "loss" in one else {}) for one in rows]
     others = [row("one", 9.0, "b.csv"), row("two", 1.0, "b.csv"), row("one", 1.0, "c")]
     ranked = batch.ranked([*rows, *others])
     assert [one["standing"] for one in ranked] == [*words, "+8.0", "best", ""]
     best = fits.FittedFiles(Path(), ranked).best
     assert (best["b.csv"], best["c"]) == ("two", "one")
     assert ("a.csv" in best) == ("best" in words or len(rows) - sum(one["result"] == "failed" for one in rows) == 1)
-
-
-def test_table_page_and_sentences(tmp_path):
-    some = [row("coat", 1.0, file=f"<{k}> #.csv", status="converged", seconds=1.0) for k in range(3)]
-    bad = {"file": "b.csv", "stack": "coat", "result": "failed", "status": "line 2: <x> is no number"}
-    rows = batch.ranked([*some, bad, row("coat", 1.0, "c.csv", result="not converged")])
-    found = fits.FittedFiles(tmp_path, rows, ("scans/README.md",))
-    report = tmp_path / "<0> #.csv" / "coat" / "report.html"
-    report.parent.mkdir(parents=True)
-    report.touch()
-    text = batch.page(found)
-    assert text.count("href=") == 1
-    for word in ("%3C0%3E%20%23.csv/coat/report.html", "&lt;0&gt; #.csv", "line 2: &lt;x&gt; is no number"):
-        assert word in text
-    assert "<0>" not in text
-    assert batch.statements(found) == [
-        "4 of 5 fits are there, 3 of them converged.",
-        "Not taken for measurements: scans/README.md.",
-    ]
-    assert len(batch.overview(some * 20, most=10).rows) == 11
+    found = fits.FittedFiles(Path(), ranked, ("scans/README.md",))
+    count, there = len(ranked), sum(one["result"] != "failed" for one in ranked)
+    assert batch.statements(found)[0].startswith(f"{there} of {count} fits are there, ")
+    assert batch.statements(found)[1] == "Not taken for measurements: scans/README.md."
+    assert len(batch.overview(ranked * 20, most=10).rows) == 11

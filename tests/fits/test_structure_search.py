@@ -1,6 +1,5 @@
 """The search for the stack behind data, by transports that are known and cheap, and the libraries that it takes."""
 
-import re
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +10,6 @@ import layerjax as lj
 from fits import structure_search
 from fits._files import locked
 from fits.prediction import cross_validation
-from fits.problem.compilation import cores
 from fits.problem.noise import Noise
 from fits.problem.parameters import Free, names_of, split
 from fits.store import Store
@@ -67,11 +65,10 @@ def test_others_get_a_discrepancy_term(data, found):
 
 
 def test_a_killed_search_resumes_and_finds_the_same(data, directory, found, monkeypatch):
-    """Killed at the second of three incidences of one of four structures: the next run makes two, and no other."""
+    """Killed as it holds out incidences of one of four structures: the next run does this one, and no other."""
     whole = Store.read(directory / STORE)
     with Store.open(directory / STORE, whole.fingerprint) as store:
-        for key in filter(re.compile("haze / diffuse").match, whole.keys()):
-            store.put(key, None)
+        store.put("haze / diffuse", None)
     made = []
     refit = cross_validation.refit
 
@@ -85,12 +82,11 @@ def test_a_killed_search_resumes_and_finds_the_same(data, directory, found, monk
     with pytest.raises(KeyboardInterrupt):
         search(data, LIBRARY, options=OPTIONS, directory=directory, **GIVEN)
     again = search(data, LIBRARY, options=OPTIONS, directory=directory, **GIVEN)
-    assert len(made) == 4
+    assert len(made) == 5
     for one, other in zip(again.candidates, found.candidates, strict=True):
         assert one.name == other.name
         np.testing.assert_array_equal(one.fit.vector, other.fit.vector)
         assert one.model_score == other.model_score
-    assert set(Store.read(directory / STORE).keys()) == set(whole.keys())
 
 
 @pytest.mark.parametrize("correlated", [pytest.param(0.2, marks=pytest.mark.slow), 1.0])
@@ -99,19 +95,6 @@ def test_the_options_of_its_fits_decide_on_a_discrepancy(data, correlated):
     options = replace(SHORT, fit=fits.FitOptions(autocorrelation=correlated))
     one = search(data, Library({"haze": COAT}, {"diffuse": BASE}), options=options, **BY_RULE)
     assert bool(one.best.fit.problem.noise.discrepancy) == (correlated < 1.0)
-
-
-def test_a_budget_of_time_ends_a_search_that_another_goes_on_with(data, tmp_path):
-    many = Library({"haze": COAT}, {f"diffuse {k}": BASE for k in range(2 * cores())})
-    given = GIVEN | {"directory": tmp_path / "it"}
-    short = search(data, many, options=replace(SHORT, budget=0.0), **given)
-    assert short.stopped
-    assert 0 < len(short.candidates) < len(many.bases)
-    assert short.best.model_score is not None
-    assert "The time budget ended the search" in " ".join(structure_search.search_sentences(short))
-    longer = search(data, many, options=replace(SHORT, budget=60.0), **given)
-    assert not longer.stopped
-    assert len(longer.candidates) == len(many.bases)
 
 
 def test_every_structure_has_the_instrument_and_another_search_is_refused(data, tmp_path):
@@ -148,7 +131,6 @@ def test_every_structure_has_the_instrument_and_another_search_is_refused(data, 
         ({"layers": 9}, r"layers is 9; it must be a whole number in \[0, 6\]"),
         ({"beam": 0.5}, "beam is 0.5; it must be a whole number"),
         ({"bic_gain": float("nan")}, "bic_gain is nan; it must be a finite number of at least 0"),
-        ({"budget": -1.0}, "budget is -1.0; it must be a finite number of at least 0"),
     ],
 )
 def test_bad_options_are_refused(options, message):
@@ -156,7 +138,7 @@ def test_bad_options_are_refused(options, message):
         SearchOptions(**options)
 
 
-def test_it_is_reported_with_one_verdict(found, tmp_path):
+def test_it_is_reported_with_one_verdict(found):
     """BIC, weight and probability had said one thing, and the score another."""
     table = structure_search.search_table(found)
     assert table.rows[0][0] == "haze / diffuse"
@@ -172,10 +154,6 @@ def test_it_is_reported_with_one_verdict(found, tmp_path):
     assert f"It is statistically indistinguishable from {found.candidates[1].name} (" in near
     assert "BIC, weight and probability do not overrule this" in near
     assert "It is ahead" not in near
-    structure_search.write_report(found, tmp_path)
-    page = (tmp_path / structure_search.PAGE).read_text()
-    assert "haze / metal" in page
-    assert "<h1>Stacks behind" in page
 
 
 # ---- libraries ----

@@ -1,4 +1,4 @@
-"""What processes, clusters and chunks add to the fits: ratios of rates, milliseconds a chunk, bytes a worker."""
+"""What processes and chunks add to the fits: ratios of rates, milliseconds a chunk, bytes a worker."""
 
 import tempfile
 from collections.abc import Iterable, Iterator, Sequence
@@ -7,7 +7,6 @@ from dataclasses import asdict, dataclass
 from typing import Any
 from unittest.mock import patch
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -18,15 +17,14 @@ from benchmarks.measuring.timing import once
 from benchmarks.measuring.writing import Bar, figure, table
 from benchmarks.studies.maps.cases import Case, StoredMap, job_of, painted_map, stored
 from benchmarks.studies.maps.fitting import PROCESSES, Report, Row, Size, finished, fitted
-from benchmarks.studies.maps.work import Meeting, Timed, redo, timed, warm_up
+from benchmarks.studies.maps.work import Meeting, Timed, redo, timed
 from benchmarks.suite.maps import goniometer_slices
+from fits.engines import local_cluster
 from fits.engines import run as run_tasks
-from fits.engines.processes import run_processes
-from fits.engines.worker import configure
 from fits.maps import texels
 from fits.maps.inputs import Block
 
-PAIR, CLUSTER = Bar(1.8, 1.95, rate=True), Bar(0.9, 0.97, rate=True)
+PAIR = Bar(1.8, 1.95, rate=True)
 OVERHEAD, MEMORY = Bar(50.0, 10.0), Bar(1.5, 0.7)
 MILLION = 1 << 20
 
@@ -70,28 +68,19 @@ def run(case: Case, rows: Sequence[Row], size: Size, report: Report) -> list[Fig
 
 
 def by_workers(one: StoredMap, size: Size, report: Report) -> list[Figure]:
-    """Rates of one worker process, of two, and of a cluster of two, in turns."""
+    """Rates of one worker process and of two, in turns."""
     job, tasks = job_of(one, size.chunk)
-    rates: dict[str, list[float]] = {"one": [], "two": [], "dask": []}
-    missing = why_no_cluster()
+    rates: dict[str, list[float]] = {"one": [], "two": []}
+    if why_no_cluster() is not None:
+        return []
     for index in range(size.rounds):
-        with _meeting(tasks, size.repeats, 1) as half:
-            rates["one"].append(steady(run_processes(timed, job, half, 1)))
-        with _meeting(tasks, PROCESSES * size.repeats, PROCESSES) as all_of_them:
-            rates["two"].append(steady(run_processes(timed, job, all_of_them, PROCESSES)))
-        if missing is None:
-            with cluster() as client:
-                client.run(configure, bool(jax.config.values["jax_enable_x64"]), threads=1)  # before it unpacks arrays
-                client.run(warm_up, job, tasks[0])
-                rates["dask"].append(steady(run_tasks(timed, job, tasks * PROCESSES * size.repeats, client=client)))
+        for name, workers in (("one", 1), ("two", PROCESSES)):
+            with _meeting(tasks, workers * size.repeats, workers) as turns, local_cluster(workers) as client:
+                rates[name].append(steady(run_tasks(timed, job, turns, client=client)))
         rates_now = ", ".join(f"{name} {values[-1]:.0f}" for name, values in rates.items() if values)
         report(f"workers, round {index + 1}: fits/s of {rates_now}")
     note = f"{figure(float(np.median(rates['one'])))} fits/s of one spawned process with one thread"
-    figures = [_ratio("2 processes against 1", rates["two"], rates["one"], PAIR, note)]
-    if missing is None:
-        note = f"{figure(float(np.median(rates['dask'])))} fits/s of a `LocalCluster` with a thread a worker"
-        figures.append(_ratio("dask with 2 workers against 2 processes", rates["dask"], rates["two"], CLUSTER, note))
-    return figures
+    return [_ratio("2 processes against 1", rates["two"], rates["one"], PAIR, note)]
 
 
 @contextmanager
@@ -117,18 +106,6 @@ def steady(results: Iterable[tuple[int, Any]]) -> float:
         within = max(0.0, min(task.ended, end) - max(task.began, begin))
         count += task.fits * within / max(task.ended - task.began, 1e-9)
     return count / (end - begin)
-
-
-@contextmanager
-def cluster(workers: int = PROCESSES) -> Iterator[Any]:
-    """A client of workers on this machine, with a thread each."""
-    import logging
-
-    from distributed import Client, LocalCluster
-
-    settings = {"n_workers": workers, "threads_per_worker": 1, "processes": True, "dashboard_address": ":0"}
-    with LocalCluster(**settings, silence_logs=logging.ERROR) as local, Client(local) as client:
-        yield client
 
 
 def why_no_cluster() -> str | None:

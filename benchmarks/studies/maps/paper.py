@@ -3,13 +3,11 @@
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
-from unittest.mock import patch
 
 from benchmarks.measuring.writing import figure, table
-from benchmarks.studies.maps.engines import cluster, why_no_cluster
+from benchmarks.studies.maps.engines import why_no_cluster
 from benchmarks.studies.maps.fitting import PROCESSES, Report, Row, Size, finished
 from benchmarks.studies.maps.work import empty
-from fits.engines import distributed
 from fits.engines import run as run_tasks
 from fits.progress import in_words
 
@@ -44,24 +42,18 @@ class Paper:
 def run(rows: Sequence[Row], size: Size, report: Report) -> tuple[list[Engine], list[Paper]]:
     """Measure the engines, and reckon."""
     report(f"{size.tasks:,} empty tasks")
-    engines = [
-        _engine("threads", run_tasks(empty, None, range(size.tasks))),
-        _engine(f"{PROCESSES} processes", run_tasks(empty, None, range(size.tasks), processes=PROCESSES)),
-    ]
+    engines = [_engine("threads", run_tasks(empty, None, range(size.tasks)))]
     handed: float | None = None
     if why_no_cluster() is None:
-        with cluster() as client, patch.object(distributed, "GROUP_SECONDS", 0.0):  # one at a time
-            engines.append(
-                _engine(f"dask, {PROCESSES} workers", run_tasks(empty, None, range(size.tasks), client=client))
-            )
+        tasks = run_tasks(empty, None, range(size.tasks), processes=PROCESSES)
+        engines.append(_engine(f"dask, {PROCESSES} workers", tasks))
         handed = engines[-1].rate
     return engines, [on_paper(row, size.chunk, handed) for row in rows]
 
 
 def on_paper(row: Row, chunk: int, handed: float | None, texels: int = TEXELS) -> Paper:
-    """One map; handed: how often a second a scheduler hands out something, of short chunks a few."""
+    """One map; handed: how often a second a scheduler hands out a chunk."""
     seconds, chunks = chunk * PROCESSES / row.rate, texels / chunk
-    handed = None if handed is None else handed * max(1, int(distributed.GROUP_SECONDS / seconds))
     least = 0.0 if handed is None else chunks / handed
     times = tuple(row.pilot + max(chunks * seconds / cores, least) for cores in CORES)
     return Paper(row.name, seconds, None if handed is None else handed * seconds, times)

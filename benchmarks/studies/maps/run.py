@@ -8,7 +8,6 @@ from benchmarks.measuring.writing import DIRECTORY, environment_lines, write
 from benchmarks.studies.maps import engines, fitting, paper
 from benchmarks.studies.maps.cases import CASES, FREE, Case
 from benchmarks.studies.maps.fitting import PROCESSES, Size
-from fits.engines import distributed
 
 NAME = "maps"
 
@@ -36,15 +35,15 @@ measurement, the largest of {checked} texels.
 
 Rates while all workers are at work: they wait for each other after the first chunk, and the last chunk of the first to
 be done ends it; medians of {rounds} rounds in turns. One worker is a spawned process with one thread and chunks
-of the same map (`processes=1` would be threads). Memory is the most that the system has seen of a worker that compiles
+of the same map. Memory is the most that the system has seen of a worker that compiles
 all programs. {missing}
 
 {workers}
 ## Scaling on paper
 
 Empty tasks through the engines on this machine, where {processes} workers share its cores with the scheduler: a
-scheduler with a machine of its own is no slower. dask has them one at a time; of chunks shorter than {enough:g} s it
-has as many together as take that long. *scheduler full at*: so many cores ask for chunks as fast as it hands them out.
+scheduler with a machine of its own is no slower. *scheduler full at*: so many cores ask for chunks as fast as it hands
+them out.
 Times of 4 million texels (2048 x 2048, 2.1 GB of values): the pilot, which one machine fits first, and chunks by
 these rates; cores as fast as these, and a disk that keeps up.
 
@@ -75,7 +74,6 @@ def study(
         free=FREE,
         chunk=size.chunk,
         processes=PROCESSES,
-        enough=distributed.GROUP_SECONDS,
         rounding=fitting.ROUNDING,
         other=fitting.OTHER,
         checked=size.checked,

@@ -89,11 +89,6 @@ def redo(job: Job, task: Block) -> int:
     return int(np.sum(results["flags"] & FLAGS["fitted"] > 0))
 
 
-def warm_up(job: Job, task: Block) -> None:
-    """Compile the programs of a map in a worker of a cluster, which gives a task to whom it likes."""
-    redo(job, task)
-
-
 def meet(folder: Path, workers: int) -> None:
     """Wait until so many have come; or no longer, if some have not even begun by then."""
     (folder / uuid.uuid4().hex).touch()

@@ -15,7 +15,7 @@ import zarr
 
 import fits
 import layerjax as lj
-from fits.engines.processes import SCRIPT_REPEATED
+from fits.engines import SCRIPT_REPEATED
 from fits.maps.store import FLAGS, NO_START, PARTIAL, SMOOTHED, Store, arrays_of, blocks_of, create, open_map
 from tests.helpers.files import contents
 from tests.helpers.painted_maps import ATTRIBUTES, NAMES, UNITS, numbers, stored

@@ -1,0 +1,347 @@
+"""Parallel execution of independent tasks: by threads, by processes of this machine, or by a Dask cluster.
+
+A function, data that all tasks have in common, and the tasks go in; results come out as they finish. A task that fails
+does not affect the others; the tasks of a worker that is killed are repeated. Processes of this machine are a cluster
+of Dask as well, whose workers have one thread each, the precision of their parent and its compiled programs.
+"""
+
+import asyncio
+import ctypes
+import errno
+import logging
+import os
+import pickle
+import signal
+import sys
+import threading
+import uuid
+import warnings
+from collections.abc import Callable, Iterable, Iterator
+from concurrent import futures
+from contextlib import contextmanager, suppress
+from itertools import islice
+from multiprocessing import current_process
+from typing import Any, NamedTuple
+
+IN_FLIGHT = 4
+"""Tasks that are submitted for each thread of a cluster: more would only take memory of the scheduler."""
+
+TIMEOUT = 60.0
+"""Seconds to wait for the first worker."""
+
+RETRIES = 3
+"""Retries of a task that fails neither by its own error nor by the death of its worker."""
+
+FULL = (errno.ENOSPC, errno.EDQUOT)
+"""Errors of a full disk, which affect every task."""
+
+SCRIPT_REPEATED = 78
+"""Exit code of a worker that runs its parent's script to the point where that starts workers."""
+
+Work = Callable[[Any, Any], Any]
+
+
+class Failure(NamedTuple):
+    """Result of a task that failed; error: what it raised, on one line, or how its workers died."""
+
+    error: str
+
+
+def run(
+    work: Work,
+    shared: Any,
+    tasks: Iterable[Any],
+    *,
+    processes: int = 1,
+    client: Any = None,
+    threads: int | None = None,
+) -> Iterator[tuple[int, Any]]:
+    """Execute all tasks; yields the index and result of each as it finishes.
+
+    Args:
+        work: called as `work(shared, task)`; a function that workers can import, if it is not sent with its code.
+        shared: data of all tasks; each worker receives them once.
+        tasks: any number of them.
+        processes, client: see `connected`; without either, threads of this process, one a core: the first task runs by
+            itself, as it compiles.
+        threads: threads of this process; None: one a core. With 1 the calling thread executes the tasks.
+
+    Yields:
+        (index, result). The result is a `Failure` if `work` raised ValueError or OSError, or its worker died four
+        times. A full disk and all other errors end the run.
+
+    Raises:
+        ValueError: as `connected`; `work`, `shared` or a task that cannot be sent to a worker.
+        OSError: no such scheduler, or one that has stopped.
+    """
+    with connected(client, processes) as connection:
+        if connection is None:
+            yield from _run_threads(work, shared, list(tasks), threads)
+        else:
+            yield from _run_cluster(work, shared, list(tasks), connection)
+
+
+@contextmanager
+def connected(client: Any, processes: int = 1) -> Iterator[Any]:
+    """A client for several calls of `run`, which is closed with the block if it was made here; None: threads.
+
+    Args:
+        client: a `distributed.Client`, or the address of a scheduler (``"tcp://..."``). Its workers have layerjax
+            installed and one thread each (``--nthreads 1``).
+        processes: without a client, so many processes of this machine with one thread each, if there are several: a
+            script then needs ``if __name__ == "__main__":``.
+
+    Raises:
+        ValueError: processes < 1; no client and no address; no `distributed`; workers that cannot start.
+        OSError: no such scheduler.
+    """
+    if processes < 1:
+        raise ValueError(f"processes is {processes}; it must be at least 1")
+    if client is None and processes == 1:
+        yield None
+        return
+    end_repeated_script()
+    try:
+        from distributed import Client
+    except ImportError:
+        needs = "processes > 1 needs" if client is None else "client= needs"
+        raise ValueError(f'{needs} distributed: pip install "layerjax[distributed]"') from None
+    if isinstance(client, Client) and not client.asynchronous:
+        yield client
+        return
+    with local_cluster(processes) if client is None else _opened(client) as connection:
+        yield connection
+
+
+@contextmanager
+def local_cluster(processes: int) -> Iterator[Any]:
+    """A client of so many processes of this machine with one thread each."""
+    from distributed import Client, LocalCluster
+
+    logger = logging.getLogger("distributed")
+    level = logger.level
+    logger.setLevel(logging.CRITICAL)  # of workers that are killed and started again
+    try:
+        cluster = LocalCluster(
+            n_workers=processes,
+            threads_per_worker=1,
+            memory_limit=0,
+            dashboard_address=None,
+            silence_logs=logging.CRITICAL,
+            env=environment(),
+            preload=__name__,
+        )
+    except Exception as error:  # its kind differs between versions
+        guard = 'the statements of a script must be under `if __name__ == "__main__":`, or processes must be 1'
+        raise ValueError(f"worker processes cannot start ({one_line(error)}): {guard}") from None
+    try:
+        with cluster, Client(cluster, set_as_default=False) as client:
+            yield client
+    finally:
+        logger.setLevel(level)
+
+
+@contextmanager
+def _opened(address: Any) -> Iterator[Any]:
+    """A client of the scheduler at this address."""
+    from distributed import Client
+    from distributed.comm.addressing import parse_address, parse_host_port
+
+    valid = False
+    with suppress(ValueError, TypeError):  # a client would wait a minute for a host that there cannot be
+        scheme, place = parse_address(address)
+        valid = scheme == "inproc" or (scheme in ("tcp", "tls", "ws", "wss", "ucx") and bool(parse_host_port(place)[0]))
+    if not valid:
+        wanted = "a distributed.Client, or the address of a scheduler, such as tcp://node1:8786"
+        raise ValueError(f"client is {address!r}; it must be {wanted}")
+    try:
+        client = Client(address, set_as_default=False)
+    except (OSError, ValueError) as error:
+        raise OSError(f"{address}: there is no scheduler ({one_line(error)})") from None
+    try:
+        yield client
+    finally:
+        with suppress(Exception):
+            client.close(timeout=1)
+
+
+def end_repeated_script() -> None:
+    """End a worker process that runs its parent's script, which has no guard, to where that starts workers: to be
+    called before anything that must not be repeated."""
+    if getattr(current_process(), "_inheriting", False):
+        sys.exit(SCRIPT_REPEATED)
+
+
+# ---- threads of this process ----
+
+
+def _run_threads(work: Work, shared: Any, tasks: list[Any], threads: int | None) -> Iterator[tuple[int, Any]]:
+    """Threads of JAX run beside each other, for they leave Python while they compute."""
+    from fits.problem.compilation import cores
+    from layerjax._numerics import broadcasting
+
+    pending, most = iter(enumerate(tasks)), threads or cores()
+    # the first by itself: it compiles the program, which keeps one core busy
+    for index, task in islice(pending, None if most == 1 else 1):
+        yield index, attempt(work, shared, task)
+    running: dict[futures.Future[Any], int] = {}
+    pool = futures.ThreadPoolExecutor(most)
+    try:
+        while True:
+            for index, task in islice(pending, most - len(running)):
+                running[pool.submit(broadcasting(attempt), work, shared, task)] = index
+            if not running:
+                return
+            for future in futures.wait(running, return_when=futures.FIRST_COMPLETED).done:
+                yield running.pop(future), future.result()
+    finally:
+        pool.shutdown(cancel_futures=True)  # waits for the tasks that have begun
+
+
+def attempt(work: Work, shared: Any, task: Any) -> Any:
+    """The result of a task, or its failure; errors that end the run are raised."""
+    try:
+        return work(shared, task)
+    except (ValueError, OSError) as error:
+        if isinstance(error, OSError) and error.errno in FULL:
+            raise
+        return Failure(one_line(error))
+
+
+def one_line(error: BaseException) -> str:
+    """An error as the command line prints it."""
+    if isinstance(error, OSError) and error.strerror and error.filename is not None:
+        return f"{error.filename}: {error.strerror[0].lower()}{error.strerror[1:]}"
+    return " ".join(str(error).split()) or type(error).__name__
+
+
+# ---- the workers of a cluster ----
+
+
+def _run_cluster(work: Work, shared: Any, tasks: list[Any], client: Any) -> Iterator[tuple[int, Any]]:
+    """A worker takes one task at a time: for several, workers with several threads use a process."""
+    import cloudpickle
+    from distributed import KilledWorker, as_completed, wait
+
+    try:
+        payload = cloudpickle.dumps((work, shared))
+        pending = iter([(index, cloudpickle.dumps(task)) for index, task in enumerate(tasks)])
+    except Exception as error:  # of any kind, as each class has its own
+        raise ValueError(f"what tasks need cannot be pickled for the workers: {one_line(error)}") from None
+    if not tasks:
+        return
+    address, name = str(getattr(client.scheduler, "address", "the cluster")), f"layerjax-{uuid.uuid4().hex[:12]}"
+    running: dict[Any, int] = {}
+
+    def require_scheduler() -> None:
+        if client.status != "running":
+            raise OSError(f"{address}: the scheduler has stopped") from None
+
+    try:
+        client.wait_for_workers(1, timeout=TIMEOUT)
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", message="Sending large graph")
+            # a task, not scattered data: it is repeated if the workers that hold it are killed
+            sent = client.submit(bytes, payload, key=f"{name}-shared")
+        with client.as_current():
+            wait([sent], timeout=TIMEOUT)
+            client.replicate([sent])  # a scheduler prefers workers that hold the data; those that die get them later
+        completed = as_completed(loop=client.loop)
+
+        def submit() -> None:
+            room = IN_FLIGHT * max(1, sum(client.nthreads().values())) - len(running)
+            for index, task in islice(pending, max(room, 0)):
+                future = client.submit(
+                    perform, sent, name, task, precision(), key=f"{name}-{index}", retries=RETRIES, pure=False
+                )
+                running[future] = index
+                completed.add(future)
+
+        submit()
+        for future in completed:
+            index = running.pop(future)
+            try:
+                result = future.result()
+            except KilledWorker as killed:
+                result = Failure(f"its worker died {getattr(killed, 'allowed_failures', 3) + 1} times")
+            except (futures.CancelledError, asyncio.CancelledError):
+                require_scheduler()
+                result = Failure("the scheduler has cancelled it")
+            future.release()
+            submit()
+            yield index, result
+    except TimeoutError:
+        raise OSError(f"{address}: no worker came within {TIMEOUT:g} s") from None
+    except (OSError, RuntimeError):
+        require_scheduler()
+        raise  # of the task
+    finally:
+        with suppress(Exception):  # of a scheduler that has stopped
+            client.cancel(list(running), force=True)
+
+
+_jobs: dict[str, Any] = {}
+_jobs_lock = threading.Lock()
+
+
+def perform(payload: bytes, name: str, task: bytes, double: bool | None) -> Any:
+    """Execute a task in a worker, which is configured, and unpacks the common data, once for each run of this name."""
+    from distributed import get_worker
+
+    with _jobs_lock:
+        if name not in _jobs:
+            configure(double, int(get_worker().state.nthreads))
+            _jobs.clear()
+            _jobs[name] = pickle.loads(payload)
+        work, shared = _jobs[name]
+    return attempt(work, shared, pickle.loads(task))
+
+
+def precision() -> bool | None:
+    """Whether this process computes in double precision; None: JAX is not imported."""
+    jax = sys.modules.get("jax")
+    return None if jax is None else bool(jax.config.jax_enable_x64)
+
+
+def configure(double: bool | None, threads: int) -> None:
+    """Configure a worker that has imported JAX: precision of the caller, a compilation cache, and this number of
+    threads, unless it has computed before."""
+    import jax
+
+    from layerjax.compiling import keep_programs
+
+    quieten()
+    if "MALLOC_TRIM_THRESHOLD_" in os.environ:  # of dask: to return memory costs more than a short task; no glibc: none
+        with suppress(OSError, AttributeError):
+            for parameter in (-1, -3):  # M_TRIM_THRESHOLD, M_MMAP_THRESHOLD
+                ctypes.CDLL(None).mallopt(parameter, 1 << 25)
+    os.environ.setdefault("NPROC", str(threads))  # from which XLA reads it; XLA_FLAGS would change results
+    if double is not None:
+        jax.config.update("jax_enable_x64", double)
+    keep_programs()
+
+
+def environment() -> dict[str, str]:
+    """Environment variables of a worker process of this machine: one thread, and the programs of its parent."""
+    from layerjax.compiling import FOLDER, LEAST
+
+    variables = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NPROC"), "1")
+    if "XLA_PYTHON_CLIENT_PREALLOCATE" not in os.environ:  # several use one accelerator
+        variables["XLA_PYTHON_CLIENT_PREALLOCATE"] = "false"
+    values = sys.modules["jax"].config.values
+    if values[FOLDER]:
+        variables |= {FOLDER.upper(): values[FOLDER], LEAST.upper(): str(values[LEAST])}
+    return variables
+
+
+def dask_setup(worker: Any) -> None:
+    """Called by a worker process of this machine as it starts, for it preloads this module: Ctrl-C is for the parent,
+    which ends its workers."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def quieten() -> None:
+    """Silence warnings of libraries that do not concern the results."""
+    # arviz announces its next version on import; compiled programs that cannot be kept are compiled again
+    warnings.filterwarnings("ignore", category=FutureWarning, module="arviz")
+    warnings.filterwarnings("ignore", message="Error (reading|writing) persistent compilation cache")

@@ -1,0 +1,157 @@
+"""Threads and a cluster give the same results; a task that fails, or kills its worker, costs itself alone."""
+
+import errno
+import multiprocessing
+import os
+import random
+import signal
+import sys
+import threading
+
+import jax
+import numpy as np
+import pytest
+
+from fits.engines import Failure, connected, local_cluster, run
+from layerjax.compiling import FOLDER, LEAST
+from tests.helpers import tasks
+from tests.helpers.places import ROOT
+from tests.helpers.tasks import running, started, wait_until
+
+distributed = pytest.importorskip("distributed")
+pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning")
+
+SCRIPT = """
+from fits.engines import run
+from tests.helpers import tasks
+{guard}for result in run(tasks.{work}, {folder!r}, range(4), processes=2): print(*result, flush=True)
+"""
+
+
+@pytest.fixture(scope="module")
+def client():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PYTHONPATH", str(ROOT))
+        with local_cluster(2) as client:
+            yield client
+    assert multiprocessing.active_children() == []
+
+
+@pytest.fixture(params=["threads", "cluster"])
+def engine(request):
+    """The arguments of an engine."""
+    return {"client": request.getfixturevalue("client") if request.param == "cluster" else None}
+
+
+def test_results_and_failures_do_not_depend_on_the_engine(engine):
+    """A task that fails costs itself alone; a full disk and a mistake end the run."""
+    assert dict(run(tasks.square, 5, range(12), **engine)) == {task: task * task + 5 for task in range(12)}
+    assert list(run(tasks.square, 5, [], **engine)) == []
+    outcomes = dict(run(tasks.picky, None, [0, 1, 2, 5], **engine))
+    failures = {1: Failure("task is 1; it must not be"), 2: Failure("there.csv: no such file or directory")}
+    assert outcomes == failures | {0: 0, 3: 5}
+    with pytest.raises(OSError, match="No space left") as full:
+        list(run(tasks.picky, None, [0, 3, 5], **engine))
+    assert (full.value.errno, full.value.filename) == (errno.ENOSPC, "full.csv")
+    with pytest.raises(TypeError, match="a mistake in the code"):
+        list(run(tasks.picky, None, [0, 4, 5], **engine))
+    transport = {"transport": lambda stack, wi, wo: None}
+    assert dict(run(tasks.nothing, transport, [1], **engine)) == {0: None}
+
+
+def test_a_single_thread_is_that_of_the_caller():
+    results = run(lambda shared, task: threading.get_ident(), None, range(4), threads=1)
+    assert list(results) == [(index, threading.get_ident()) for index in range(4)]
+
+
+def test_a_worker_has_the_settings_of_its_parent(client):
+    """By the address of the scheduler: precision, compile cache, one thread, deaf to Ctrl-C."""
+    large = np.arange(10_000.0)
+    for _, worker in run(tasks.surroundings, large, [0, 1], client=client.scheduler.address):
+        assert worker["total"] == 64.0**3
+        assert worker["double"]
+        assert (worker["cache"], worker["least"]) == (jax.config.values[FOLDER], jax.config.values[LEAST])
+        assert worker["flags"] == os.environ.get("XLA_FLAGS", "")  # with others, results differ in their last digits
+        assert (worker["threads"], worker["interrupts"]) == ("1", True)
+        np.testing.assert_array_equal(worker["shared"], large)
+
+
+def test_workers_share_the_tasks_and_one_that_is_killed_costs_nothing(client, tmp_path):
+    chance = random.Random(3)
+
+    def kill():
+        for _ in range(2):
+            wait_until(lambda: len(list(tmp_path.iterdir())) >= 2)
+            os.kill(int(chance.choice(sorted(tmp_path.iterdir())).name), signal.SIGKILL)  # what it held is sent again
+            for path in tmp_path.iterdir():
+                path.unlink()
+
+    thread = threading.Thread(target=kill)
+    thread.start()
+    outcomes = dict(run(tasks.slow, str(tmp_path), range(40), client=client))
+    thread.join()
+    assert outcomes == {index: index * index for index in range(40)}
+
+
+@pytest.mark.slow
+def test_a_task_that_kills_its_worker_costs_itself_alone(client, tmp_path):
+    outcomes = dict(run(tasks.deadly, str(tmp_path / "tried"), range(6), client=client))
+    assert outcomes.pop(2) == Failure("its worker died 4 times")
+    assert outcomes == {index: index for index in (0, 1, 3, 4, 5)}
+    assert (tmp_path / "tried").read_text().split().count("2") == 4
+
+
+def test_leaving_the_loop_cancels_what_was_submitted(client, tmp_path):
+    results = run(tasks.slow, str(tmp_path), range(1000), client=client)
+    next(results)
+    results.close()
+    wait_until(lambda: not any(client.processing().values()), 10.0)
+
+
+def test_a_script_without_a_main_guard_is_refused(tmp_path):
+    (tmp_path / "script.py").write_text(SCRIPT.format(guard="", work="slow", folder=str(tmp_path)))
+    with started([str(tmp_path / "script.py")]) as process:
+        output, error = process.communicate(timeout=60)
+    assert (process.returncode, output) == (1, "")
+    last = error.strip().splitlines()[-1]
+    assert last.startswith("ValueError: worker processes cannot start (")
+    assert '`if __name__ == "__main__":`' in last
+
+
+@pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGKILL], ids=lambda sent: sent.name)
+def test_workers_end_with_their_parent(tmp_path, sent):
+    """While they work. Ctrl-C goes to all processes of a terminal; a parent that is killed can end nobody."""
+    guard = 'if __name__ == "__main__":\n    '
+    (tmp_path / "script.py").write_text(SCRIPT.format(guard=guard, work="endless", folder=str(tmp_path)))
+    with started([str(tmp_path / "script.py")]) as process:
+        wait_until(lambda: sum(path.name.isdigit() for path in tmp_path.iterdir()) == 2, 60.0)
+        workers = [int(path.name) for path in tmp_path.iterdir() if path.name.isdigit()]
+        assert any(map(running, workers))
+        os.killpg(process.pid, sent) if sent == signal.SIGINT else process.kill()
+        process.wait(timeout=20)
+        wait_until(lambda: not any(map(running, workers)), 10.0)
+        error = process.stderr.read()
+    assert process.returncode == -sent
+    assert error.count("KeyboardInterrupt") == (sent == signal.SIGINT)
+
+
+def test_what_is_no_cluster_is_refused(client, monkeypatch):
+    import dask
+
+    def refused(message, error=ValueError, **more):
+        with pytest.raises(error, match=message):
+            list(run(tasks.nothing, None, [1], **more))
+
+    refused("processes is 0; it must be at least 1", processes=0)
+    for address in (3, "", "head", "8786", "tcp://:8786", "http://head:8786"):
+        refused(f"client is {address!r}; it must be a distributed.Client, or the address", client=address)
+    with dask.config.set({"distributed.comm.timeouts.connect": "1s"}):
+        refused(r"tcp://127\.0\.0\.1:9: there is no scheduler", OSError, client="tcp://127.0.0.1:9")
+    with pytest.raises(ValueError, match="cannot be pickled for the workers"):
+        list(run(tasks.nothing, threading.Lock(), [1], client=client))
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    refused(r'client= needs distributed: pip install "layerjax\[distributed\]"', client="tcp://127.0.0.1:9")
+    refused("processes > 1 needs distributed", processes=2)
+    monkeypatch.setattr(multiprocessing.current_process(), "_inheriting", True, raising=False)
+    with pytest.raises(SystemExit), connected(None, 2):
+        pass
