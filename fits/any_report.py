@@ -5,7 +5,7 @@ from pathlib import Path
 
 from fits._files import require_switch, write_text
 from fits.data.measurements import TO_HAVE_THEM, Measurements
-from fits.maps.report import page
+from fits.maps.report import report as report_map
 from fits.maps.store import FittedMap
 from fits.optimise.result import Fit
 from fits.reports import html
@@ -52,7 +52,7 @@ def report(
     if isinstance(fit, FittedMap):
         if posterior is not None or others or held_out is not None:
             raise ValueError("posterior, others, held_out: a map has none; it is reported by itself")
-        page.report(fit, path, force)
+        report_map(fit, path, force)
         return
     fit.require_one("report")
     whole = html.FitReport(fit, posterior, others or {}, name, held_out, options)

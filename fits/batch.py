@@ -171,9 +171,9 @@ def fit_files(
     require_switch("reports", reports)
     require_switch("force", force)
     read_options, out, progress = read_options or ReadOptions(), given_path("out", out), given_progress(progress)
-    paths, skipped = _measurement_files(_several("files", files), read_options.format)
-    named_stacks = _by_name((one, one.stem) for one in _several("stacks", stacks))
-    given = {name: read_problem(path) for name, path in named_stacks.items()}
+    files, stacks = _several("files", files), _several("stacks", stacks)
+    paths, skipped = _measurement_files(files, read_options.format)
+    given = {name: read_problem(path) for name, path in _by_name((one, one.stem) for one in stacks).items()}
     if not given:
         raise ValueError("no stack is given; there must be at least one")
     for problem in given.values():

@@ -35,8 +35,8 @@ def fit_map(arguments: Namespace) -> int:
             raise ValueError("--spatial-scale: must be one number for all parameters, or one for each name")
         prior = SpatialPrior(arguments.spatial_prior, scales.get("", scales), arguments.spatial_rounds)
     use_jax()
+    from fits.maps import report
     from fits.maps.fit_map import fit_map as run
-    from fits.maps.report import summary
     from fits.problem.stack_file import read_problem
 
     given = read_problem(arguments.stack)
@@ -64,11 +64,11 @@ def fit_map(arguments: Namespace) -> int:
                 progress=progress,
             ),
         )
-    found, common = summary.summarise(map), replace(summary.common_table(map), title="Common to all texels")
-    show(summary.count_table(found), summary.quartile_table(found, map), *([common] if common.rows else []))
+    found, common = report.summarise(map), report.common_table(map)
+    show(report.count_table(found), report.quartile_table(found, map), *([common] if common.rows else []))
     if prior is not None:
-        show(summary.smoothing_words(map))
-    show(*summary.noise_words(map), f"Store: {arguments.out}. For the report: layerjax report {arguments.out}")
+        show(report.smoothing_words(map))
+    show(*report.noise_words(map), f"Store: {arguments.out}. For the report: layerjax report {arguments.out}")
     whole = found.done == found.texels and found.fitted > 0
     return DONE if whole and found.converged >= map.option("converged_share") else DOUBTFUL
 
@@ -80,14 +80,14 @@ def report_map(arguments: Namespace) -> int:
     path = Path(arguments.directory)
     out = arguments.out or (path if path.name else path.resolve()).with_suffix(".html")
     require_free_place(out, arguments.force)
-    from fits.maps.report import page, summary
+    from fits.maps import report
     from fits.maps.store import open_map
 
     map = open_map(arguments.directory)
     with show_progress() as progress:
-        found = page.report(map, out, arguments.force, progress)
-    quartiles = [summary.quartile_table(found, map)] if found.fitted else []
-    show(summary.count_table(found), *quartiles, *summary.verdict(found, map)[0], f"Report: {out}")
+        found = report.report(map, out, arguments.force, progress)
+    quartiles = [report.quartile_table(found, map)] if found.fitted else []
+    show(report.count_table(found), *quartiles, *report.verdict(found, map)[0], f"Report: {out}")
     return DONE
 
 

@@ -17,18 +17,17 @@ from numpy.typing import NDArray
 
 import layerjax as lj
 from fits._files import given_path, locked
-from fits.data.geometry import direction
 from fits.engines import Failure, connected, end_repeated_script, run
 from fits.maps.inputs import Block, MapData, Measured, block_words, map_data
 from fits.maps.options import DEFAULT, VERDICTS, MapOptions
-from fits.maps.pilot import Job, assemble, fit_pilot, make_prototype, pilot_texels
+from fits.maps.pilot import Job, fit_pilot, job_of, make_prototype, pilot_texels
 from fits.maps.search import neighbours_of, reduced_chi_square, search
 from fits.maps.spatial import smooth_map
-from fits.maps.store import FLAGS, PILOT, FittedMap, Store, arrays_of, blocks_of, create, open_map, resume
+from fits.maps.store import FLAGS, FittedMap, Store, arrays_of, blocks_of, create, open_map, resume
 from fits.maps.texels import standard_errors
 from fits.problem.model import Transport
 from fits.problem.noise import Noise, is_assumed
-from fits.problem.parameters import is_free, with_values
+from fits.problem.parameters import is_free
 from fits.problem.problem import with_floor
 from fits.store import fingerprint, portable_repr
 from layerjax._checks import require_kind
@@ -97,8 +96,8 @@ def _fit(
     path: Path, data: MapData, stack: Any, noise: Noise | None, transport: Any, options: MapOptions, client: Any
 ) -> FittedMap:
     # 1. whose map it is
-    identity, measurements = _identity(stack, noise, transport, data.samples, options), data.fingerprints()
-    store = resume(path, identity, measurements, options.force)
+    identity = _identity(stack, noise, transport, options) | {"measurements": data.fingerprint()}
+    store = resume(path, identity, options.force)
 
     # 2. the pilot: what all chunks have in common
     if options.instrument is not None:  # the floor of a map's noise stands in one place
@@ -106,26 +105,27 @@ def _fit(
         options = replace(options, instrument=replace(options.instrument, floor=None))
     texels = pilot_texels(data, options.pilot_texels)
     problem = make_prototype(texels, data, stack, noise, transport, options)
-    kept = None if store is None else store.load_group(PILOT)
-    if kept is None:
+    if store is None:
         arrays, about = fit_pilot(problem, texels, data.shape, options)
-        if store is None:
-            names = [name for name in problem.names if name not in about["common"]]
-            about |= {"names": names, "units": {name: problem.units[name] for name in names}, "shape": data.shape}
-            about |= {"chunk": tile(data.shape, options.chunk_size), "options": options.numbers(), "stack": repr(stack)}
-            about |= {"samples": data.samples, "channels": list(problem.data.channels), "version": lj.__version__}
-            assumed = problem.objective == "likelihood" and is_assumed(noise or Noise(), problem.data)
-            about |= {"noise_assumed": assumed}
-            store = create(path, about | {"fingerprints": identity, "measurements": measurements})
-        store.save_group(PILOT, arrays, {})
-        kept = store.load_group(PILOT)
-    assert store is not None
-    assert kept is not None
-    pilot = assemble(problem, data.geometry is None, kept[0], store.attributes, options)
+        names = [name for name in problem.names if name not in about["common"]]
+        about |= {
+            "names": names,
+            "units": {name: problem.units[name] for name in names},
+            "shape": data.shape,
+            "chunk": tile(data.shape, options.chunk_size),
+            "samples": data.samples,
+            "channels": list(problem.data.channels),
+            "options": options.numbers(),
+            "stack": repr(stack),
+            "noise_assumed": problem.objective == "likelihood" and is_assumed(noise or Noise(), problem.data),
+            "version": lj.__version__,
+            "fingerprints": identity,
+        }
+        store = create(path, about, arrays)
 
     # 3. all chunks
     is_sent = not data.in_file and client is not None
-    job = Job(str(path.resolve()), pilot, replace(options, progress=None), None if is_sent else data)
+    job = job_of(store, problem, data.geometry is None, options, None if is_sent else data)
     if failures := _fit_chunks(store, job, data, client, options):
         named = [*failures[:NAMED], *([f"and {len(failures) - NAMED} more"] if len(failures) > NAMED else [])]
         raise ValueError(f"{path}: {'; '.join(named)}; all other chunks are done, and another run does these")
@@ -136,34 +136,27 @@ def _fit(
     return open_map(path)
 
 
-def _identity(stack: Any, noise: Noise | None, transport: Any, samples: int, options: MapOptions) -> dict[str, str]:
-    """Fingerprints of what makes a fit, by name; of a transport that is a function, by what it predicts."""
+def _identity(stack: Any, noise: Noise | None, transport: Any, options: MapOptions) -> dict[str, str]:
+    """Fingerprints of what makes a fit, by name; of a transport that is a function, by its name."""
 
     def parts_of(tree: Any) -> list[Any]:
         leaves, structure = jax.tree.flatten(tree, is_leaf=is_free)
         return [portable_repr(structure), *leaves]
 
     parts = {"stack": stack, "noise": noise, "transport": transport, **options.model}
-    parts = {name: parts_of(one) for name, one in parts.items()}
-    if not isinstance(transport, str | lj.Transport):
-        start = jax.tree.map(
-            lambda leaf: jnp.asarray(leaf.arrays()[0]) if is_free(leaf) else leaf, stack, is_leaf=is_free
-        )
-        angles = np.linspace(5.0, 75.0, samples)
-        wi, wo = direction(angles, 0.0 * angles), direction(angles[::-1], 20.0 * angles)
-        parts["transport"] += [np.asarray(jax.jit(transport)(with_values(start), wi, wo), np.float32)]
     numbers = {name: one for name, one in options.numbers().items() if name not in VERDICTS}
-    return fingerprint(**parts, **numbers, precision=str(np.dtype(jnp.result_type(float))))
+    precision = str(np.dtype(jnp.result_type(float)))
+    return fingerprint(**{name: parts_of(one) for name, one in parts.items()}, **numbers, precision=precision)
 
 
 def tile(shape: tuple[int, ...], texels: int) -> tuple[int, ...]:
     """The shape of a chunk of at most so many texels, as square as the last axes of a map allow."""
     sides, remaining = [1] * len(shape), texels
-    if len(shape) > 1:
-        sides[-1] = min(shape[-1], max(math.isqrt(texels), texels // shape[-2]))
-        remaining //= sides[-1]
-    for axis in reversed(range(max(1, len(shape) - 1))):
-        sides[axis] = max(1, min(shape[axis], remaining))
+    for axis in reversed(range(len(shape))):
+        square = (
+            max(math.isqrt(texels), texels // shape[-2]) if len(shape) > 1 and axis == len(shape) - 1 else remaining
+        )
+        sides[axis] = max(1, min(shape[axis], square))
         remaining //= sides[axis]
     return tuple(sides)
 
@@ -204,8 +197,8 @@ def work(job: Job, task: tuple[Block, Measured | None]) -> dict[str, int]:
 
 def fit_chunk(job: Job, measured: Measured) -> dict[str, NDArray[Any]]:
     """The arrays of a store for one chunk, by their names, each of the chunk's shape."""
-    problem, size, shape = job.pilot.problem, job.options.chunk_size, measured.mask.shape
-    names, mask, texels = problem.names, measured.mask.reshape(-1), job.pilot.texels(measured)
+    problem, size, shape = job.problem, job.options.chunk_size, measured.mask.shape
+    names, mask, texels = problem.names, measured.mask.reshape(-1), job.texels(measured)
     results = {name: np.full(texels.number, fill, dtype) for name, (dtype, fill) in arrays_of(names).items()}
     results["measurements"][:] = texels.measurements
     enough = texels.measurements >= len(names)
@@ -218,7 +211,7 @@ def fit_chunk(job: Job, measured: Measured) -> dict[str, NDArray[Any]]:
         places = np.full(texels.number + 1, -1)  # among the texels that are fitted; the last is none
         places[fitted] = np.arange(len(fitted))
         neighbours = places[neighbours_of(shape)[fitted]]
-        best, start, poor, restarted = search(problem, job.pilot.starts, rows, size, job.options, neighbours)
+        best, poor, restarted = search(problem, job.starts, rows, size, job.options, neighbours)
         finite, (errors, at_bound, unidentified) = best.finite, standard_errors(problem, best, rows)
         numbers = {"reduced_chi_square": reduced_chi_square(best, rows)}
         for place, name in enumerate(names):
@@ -227,7 +220,6 @@ def fit_chunk(job: Job, measured: Measured) -> dict[str, NDArray[Any]]:
             results[name][fitted] = np.where(finite, array, np.nan)
         bits = 1 << np.arange(len(names), dtype=np.uint64)
         results["at_bound"][fitted] = np.sum(np.where(at_bound & finite[:, None], bits, 0), axis=1)
-        results["start"][fitted] = start
         for meaning, holds in {
             "fitted": finite,
             "failed": ~finite,

@@ -1,7 +1,7 @@
 """Measurements of a map: values of every texel, their directions, standard deviations and a mask, read block by block.
 
 A map is an array (..., N, C): texels along the leading axes, N measurements of each, C channels; or (..., N) for one
-channel. It may be far larger than memory. Arrays of numpy, .npy files, HDF5, zarr and xarray all become variables of
+channel. It may be far larger than memory. Arrays of numpy, .npy files, HDF5, zarr and xarray all become arrays of
 xarray, whose numbers are read when they are accessed.
 """
 
@@ -38,9 +38,6 @@ VECTORS, ANGLES = ("wi", "wo"), ("theta_i", "phi_i", "theta_o", "phi_o")
 FILES = (".npy", ".h5", ".hdf5", ".zarr")
 NORMAL = (0.0, 0.0, 1.0)
 
-UNREADABLE = "?"
-"""In the place of the fingerprint of a block that cannot be read."""
-
 WHOLE, BLOCKS = 2**23, 64
 """Numbers of a map that is fingerprinted as a whole; and blocks that are of any."""
 
@@ -56,30 +53,102 @@ class _Stored(BackendArray):
 
     def __getitem__(self, key: indexing.ExplicitIndexer) -> Any:
         support = indexing.IndexingSupport.BASIC
-        return indexing.explicit_indexing_adapter(key, self.shape, support, self._read)
-
-    def _read(self, key: Any) -> Any:
-        return np.asarray(self.array[key])
+        return indexing.explicit_indexing_adapter(key, self.shape, support, lambda key: np.asarray(self.array[key]))
 
 
 def _array(source: Any, where: str) -> xr.DataArray:
     """An array of numpy, h5py, zarr or xarray, or what numpy makes one of, under the name that errors call it."""
     if isinstance(source, xr.DataArray | xr.Variable):
         variable = source if isinstance(source, xr.Variable) else source.variable
+        unnamed = [(name, f"dim_{axis}") for axis, name in enumerate(variable.dims) if str(name).startswith("phony_dim")]
+        variable = variable.to_base_variable()._replace(dims=[dict(unnamed).get(name, name) for name in variable.dims])
     else:
-        if isinstance(source, np.ma.MaskedArray):
-            source = np.ma.filled(source.astype(np.float64), np.nan)
         array = source if hasattr(source, "dtype") and hasattr(source, "shape") else np.asarray(source)
-        attributes = dict(getattr(array, "attrs", {}))  # factor, offset, and the number that stands for nothing
-        names = [name for name in ("_FillValue", "scale_factor", "add_offset") if name in attributes]
-        packing = {name: np.ravel(attributes[name])[0] for name in names}
+        if isinstance(array, np.ma.MaskedArray):
+            array = np.ma.filled(array.astype(np.float64), np.nan)
         dims = [f"dim_{axis}" for axis in range(len(array.shape))]
-        variable = xr.Variable(dims, indexing.LazilyIndexedArray(_Stored(array)), packing)
-        if array.dtype.kind in "biuf":
-            variable = xr.conventions.decode_cf_variable(where, variable, decode_times=False)
+        variable = xr.Variable(dims, indexing.LazilyIndexedArray(_Stored(array)))
     if variable.dtype.kind not in "biuf":
         raise ValueError(f"{where} holds {variable.dtype}, must hold real numbers")
     return xr.DataArray(variable, name=where)
+
+
+def _arrays(source: Any, wanted: str) -> Arrays:
+    """The arrays of numbers of a file, a Dataset or a mapping; or one array by the wanted name, and those beside it."""
+    if isinstance(source, str | os.PathLike):
+        return _arrays_of_file(str(source), wanted)
+    if isinstance(source, Mapping):
+        return _numbers(source.variables if isinstance(source, xr.Dataset) else source, wanted)
+    beside = _numbers(source.coords, wanted) if isinstance(source, xr.DataArray) else {}
+    return beside | {wanted: _array(source, wanted)}
+
+
+def _numbers(members: Mapping[Any, Any], where: str) -> Arrays:
+    """Those of these arrays that hold numbers; whatever else lies there is skipped."""
+    found = {str(name): one for name, one in members.items() if getattr(one, "dtype", np.dtype(float)).kind in "biuf"}
+    return {name: _array(one, f"{where}/{name}") for name, one in found.items()}
+
+
+def _arrays_of_file(source: str, wanted: str) -> Arrays:
+    """The arrays of a file, or of the group that is named as ``file.h5:/group``; an array that is named so by the
+    wanted name, beside the others of its group."""
+    inside = re.fullmatch(r"(.+\.(?:h5|hdf5|zarr)):/(.*)", source, re.IGNORECASE)
+    path, name = (inside[1], inside[2].strip("/")) if inside else (source, "")
+    require_there(path)
+    suffix = Path(path).suffix.lower()
+    if any((Path(path) / file).is_file() for file in ("zarr.json", ".zarray", ".zgroup")):
+        suffix = ".zarr"
+    if suffix not in FILES or (suffix != ".zarr" and os.path.isdir(path)):
+        raise ValueError(
+            f"{path}: a map is one array, in one of {', '.join(FILES)}; files of measurements are for layerjax fit and "
+            "layerjax fit-many"
+        )
+    folder, _, last = name.rpartition("/")
+    try:
+        root = np.load(path, mmap_mode="r", allow_pickle=False) if suffix == ".npy" else _opened(path, suffix)
+        node = root[name] if name else root
+        is_array = hasattr(node, "dtype")
+        group = folder if is_array else name
+        members = {} if is_array and not name else _group(path, suffix, group)
+    except KeyError:
+        raise ValueError(f"{path}: holds no {name!r}") from None
+    except Exception as error:  # codecs raise what they like
+        raise ValueError(f"{path}: cannot be read: {one_line(error)}") from None
+    arrays = _numbers(members, f"{path}:/{group}".rstrip("/"))
+    if is_array:
+        arrays[wanted] = arrays[last] if last in arrays else _array(node, source)
+    return arrays
+
+
+def _opened(path: str, suffix: str) -> Any:
+    if suffix == ".zarr":
+        import zarr
+
+        return zarr.open(path, mode="r")
+    import h5py
+
+    return h5py.File(path, "r")
+
+
+def _group(path: str, suffix: str, name: str) -> Mapping[Any, Any]:
+    """The arrays of a group as xarray reads them: with factor, offset and the number that stands for nothing."""
+    options: dict[str, Any] = {"group": name or None, "decode_times": False}
+    if suffix != ".zarr":
+        return xr.open_dataset(path, engine="h5netcdf", phony_dims="access", **options).variables
+    try:
+        return xr.open_zarr(path, consolidated=False, chunks=None, **options).variables
+    except (KeyError, ValueError):  # axes without names
+        root = _opened(path, suffix)
+        return dict((root[name] if name else root).arrays())
+
+
+def _choose(source: Any, wanted: str, arrays: Arrays) -> xr.DataArray:
+    """The array of the wanted name, or the only one."""
+    if wanted not in arrays and len(arrays) != 1:
+        where = source if isinstance(source, str | os.PathLike) else wanted
+        names = f"there are {', '.join(sorted(arrays)[:9])}" if arrays else "there is none"
+        raise ValueError(f"{where}: no array {wanted!r} of numbers, {names}; PATH:/NAME chooses another")
+    return arrays[wanted] if wanted in arrays else next(iter(arrays.values()))
 
 
 def _read(array: xr.DataArray, block: Block = ()) -> Floats:
@@ -112,82 +181,6 @@ def _with_axes(array: xr.DataArray, sizes: Mapping[str, int], *choices: tuple[st
 def _ordered(array: xr.DataArray, dims: tuple[Hashable, ...]) -> xr.DataArray:
     """The same with its named axes in this order, as far as it has them, and others last."""
     return array.transpose(*(name for name in dims if name in array.dims), ...)
-
-
-def _arrays(source: Any, wanted: str) -> Arrays:
-    """The arrays of a file, a group, a Dataset or a mapping; or one array by the wanted name, and those beside it."""
-    if isinstance(source, str | os.PathLike):
-        return _arrays_of_file(str(source), wanted)
-    coordinates = _members(source.coords, f"{wanted}/") if isinstance(source, xr.Dataset | xr.DataArray) else {}
-    if isinstance(source, Mapping) or hasattr(source, "array_keys"):  # Datasets of xarray and groups are such
-        return coordinates | _members(source, f"{wanted}/")
-    return coordinates | {wanted: _array(source, wanted)}
-
-
-def _members(group: Any, where: str) -> Arrays:
-    """The arrays of numbers in a group; whatever else lies there is skipped."""
-    if hasattr(group, "array_keys"):  # of zarr; with the names of axes where it has them, as xarray writes it
-        try:
-            options: dict[str, Any] = {"consolidated": False, "chunks": None, "decode_times": False}
-            group = xr.open_zarr(group.store, group=group.path, **options).variables
-        except (KeyError, ValueError):
-            group = dict(group.arrays())
-    return {
-        str(name): _array(one, f"{where}{name}")
-        for name, one in group.items()
-        if not isinstance(one, Mapping) and (not hasattr(one, "dtype") or one.dtype.kind in "biuf")
-    }
-
-
-def _arrays_of_file(source: str, wanted: str) -> Arrays:
-    """The arrays of a file; or that which is named as ``file.h5:/name``, by the wanted name, and those beside it."""
-    inside = re.fullmatch(r"(.+\.(?:h5|hdf5|zarr)):/(.*)", source, re.IGNORECASE)
-    path, name = (inside[1], inside[2].strip("/")) if inside else (source, "")
-    require_there(path)
-    suffix = Path(path).suffix.lower()
-    if any((Path(path) / file).is_file() for file in ("zarr.json", ".zarray", ".zgroup")):
-        suffix = ".zarr"
-    if suffix not in FILES or (suffix != ".zarr" and os.path.isdir(path)):
-        raise ValueError(
-            f"{path}: a map is one array, in one of {', '.join(FILES)}; files of measurements are for layerjax fit and "
-            "layerjax fit-many"
-        )
-    folder, _, last = name.rpartition("/")
-    try:
-        root: Any = _open(path, suffix)
-        node = root[name] if name else root
-        is_array = hasattr(node, "dtype")
-        group = (root[folder] if folder else root) if name and is_array else node
-        place = f"{path}:/{folder if is_array else name}".rstrip("/") + "/"
-    except KeyError:
-        raise ValueError(f"{path}: holds no {name!r}") from None
-    except Exception as error:  # codecs raise what they like
-        raise ValueError(f"{path}: cannot be read: {one_line(error)}") from None
-    arrays = {} if is_array and not name else _members(group, place)
-    if is_array:
-        arrays[wanted] = arrays[last] if last in arrays else _array(node, source)
-    return arrays
-
-
-def _open(path: str, suffix: str) -> Any:
-    if suffix == ".npy":
-        return np.load(path, mmap_mode="r", allow_pickle=False)
-    if suffix == ".zarr":
-        import zarr
-
-        return zarr.open(path, mode="r")
-    import h5py
-
-    return h5py.File(path, "r")
-
-
-def _choose(arrays: Arrays, wanted: str, source: Any) -> xr.DataArray:
-    """The array of the wanted name, or the only one."""
-    if wanted not in arrays and len(arrays) != 1:
-        where = source if isinstance(source, str | os.PathLike) else wanted
-        names = f"there are {', '.join(sorted(arrays)[:9])}" if arrays else "there is none"
-        raise ValueError(f"{where}: no array {wanted!r}, {names}; PATH:/NAME chooses another")
-    return arrays[wanted] if wanted in arrays else next(iter(arrays.values()))
 
 
 # ---- the measurements of a map ----
@@ -270,19 +263,12 @@ class MapData:
         variable = xr.Variable(array.dims, _read(array, block))
         return np.array(variable.set_dims({**sizes, SAMPLE: self.samples, CHANNEL: self.channels}).values)
 
-    def fingerprints(self) -> list[str]:
+    def fingerprint(self) -> str:
         """What distinguishes these measurements from others: of shape and directions, and of blocks from all over the
-        map, the whole of it up to 64 MiB; "?" of a block that cannot be read."""
+        map, the whole of it up to 64 MiB. ValueError: a block cannot be read."""
         common = () if self.geometry is None else (self.geometry.wi, self.geometry.wo)
-        parts: list[Any] = [[self.shape, self.samples, self.channels, *common]]
-        for block in self._blocks():
-            try:  # one of the many NaNs, and one zero of the two
-                parts.append(
-                    [one if one is None else np.where(np.isnan(one), np.nan, one + 0.0) for one in self.read(block)]
-                )
-            except ValueError:
-                parts.append(UNREADABLE)
-        return [one if one == UNREADABLE else fingerprint(part=one)["part"] for one in parts]
+        parts = [fingerprint(part=list(self.read(block))) for block in self._blocks()]
+        return fingerprint(measurements=[[self.shape, self.samples, self.channels, *common], parts])["measurements"]
 
     def _blocks(self) -> list[Block]:
         """At most 64 of them: slabs that hold all of a map, or of a larger one single texels."""
@@ -314,7 +300,7 @@ def map_data(values: Any, geometry: Any = None, sigma: Any = None, mask: Any = N
         ValueError: an array is not there or no such array, or shapes do not fit together.
     """
     arrays = _arrays(values, "values")
-    array = _choose(arrays, "values", values)
+    array = _choose(values, "values", arrays)
     if 0 in array.shape:
         raise ValueError(f"{array.name} has shape {array.shape}, must hold something along every axis")
     array = array.transpose(..., *(name for name in (SAMPLE, CHANNEL) if name in array.dims))
@@ -340,8 +326,7 @@ def map_data(values: Any, geometry: Any = None, sigma: Any = None, mask: Any = N
     def other(source: Any, wanted: str, *choices: tuple[str, ...]) -> xr.DataArray | None:
         if source is None:
             return None
-        chosen = _ordered(_choose(_arrays(source, wanted), wanted, source), array.dims)
-        return _with_axes(chosen, sizes, *choices)
+        return _with_axes(_ordered(_choose(source, wanted, _arrays(source, wanted)), array.dims), sizes, *choices)
 
     deviations = other(sigma, "sigma", (*texels, SAMPLE, CHANNEL), (*texels, SAMPLE), (SAMPLE,))
     part = other(mask, "mask", texels)

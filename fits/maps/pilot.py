@@ -5,7 +5,6 @@ have in common, where all other fits begin, and which chi-squares are to be expe
 chunks that are left as the first would have.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any
@@ -22,7 +21,7 @@ from fits.maps.emulator import Emulator, emulate, with_emulator
 from fits.maps.inputs import Block, MapData, Measured
 from fits.maps.options import MapOptions
 from fits.maps.search import Results, Starts, fit_first, reduced_chi_square, search, sigmas, starts_at
-from fits.maps.store import Store
+from fits.maps.store import PILOT, Store
 from fits.maps.texels import Texels, make_texels, with_own_directions
 from fits.optimise.fit import fit
 from fits.optimise.multi_start import start_points
@@ -42,20 +41,26 @@ MOST_PARAMETERS = 32
 
 
 @dataclass(frozen=True, eq=False)
-class Pilot:
-    """What all chunks of a map have in common.
+class Job:
+    """What all chunks of a map have in common, for those who do the work.
 
     Attributes:
+        path: of the store.
         prototype: the problem of a texel, with common parameters held, and a resolution.
         emulator: in the place of its transport; None: that itself.
-        starts: of all other fits.
+        starts: of all fits but those of the pilot.
+        options: of the map; its chunk size is that of the program.
+        data: the measurements; None where each task brings its own.
     """
 
+    path: str
     prototype: Problem
     emulator: Emulator | None
     starts: Starts
+    options: MapOptions
+    data: MapData | None
 
-    def __getstate__(self) -> dict[str, Any]:  # a model does not outlive its process
+    def __getstate__(self) -> dict[str, Any]:  # a model and an open store do not outlive their process
         return {one.name: getattr(self, one.name) for one in fields(self)}
 
     @cached_property
@@ -63,9 +68,21 @@ class Pilot:
         """The problem of a texel, with the model of a map."""
         return map_problem(self.prototype, self.starts.known is None, self.emulator)
 
+    @cached_property
+    def store(self) -> Store:
+        """The store, opened once in each process."""
+        return Store(self.path)
+
     def texels(self, measured: Measured) -> Texels:
         """Those of a block, one after the other."""
         return texels_of(measured, least_floor(self.prototype))
+
+    def measured(self, block: Block, measured: Measured | None) -> Measured:
+        """The measurements of a block; measured: as the task brings them."""
+        if measured is not None:
+            return measured
+        assert self.data is not None
+        return self.data.read(block)
 
 
 def map_problem(problem: Problem, own_directions: bool, emulator: Emulator | None) -> Problem:
@@ -97,20 +114,15 @@ def pilot_texels(data: MapData, count: int) -> Texels:
         raise ValueError("mask: no texel takes part, it is 0 everywhere")
     order = candidates[((np.arange(MOST_TRIED) + 0.5) * GOLDEN % 1.0 * candidates.size).astype(int)]
     chosen: dict[int, Texels] = {}
-    failure: ValueError | None = None
     for place in dict.fromkeys(order.tolist()):
-        try:
-            at = np.unravel_index(place, data.shape)
-            row = texels_of(data.read(tuple(slice(int(one), int(one) + 1) for one in at)), 0.0)
-        except ValueError as error:  # what cannot be read is reported with its chunk
-            failure = failure or error
-            continue
+        at = np.unravel_index(place, data.shape)
+        row = texels_of(data.read(tuple(slice(int(one), int(one) + 1) for one in at)), 0.0)
         if row.measurements[0]:
             chosen[place] = row
         if len(chosen) == count:
             break
     if not chosen:
-        raise failure or ValueError("values: no measurement of a texel that takes part is a finite number")
+        raise ValueError("values: no measurement of a texel that takes part is a finite number")
     rows = [chosen[place] for place in sorted(chosen)]
     return Texels(*(None if one[0] is None else np.concatenate(one) for one in zip(*rows, strict=True)))
 
@@ -239,22 +251,23 @@ def fit_pilot(
     return arrays, about | {"numerical": numerical | {"error": error}}
 
 
-def assemble(
-    problem: Problem, own_directions: bool, arrays: Mapping[str, Any], about: Mapping[str, Any], options: MapOptions
-) -> Pilot:
-    """The pilot by what a store keeps of it, see `fit_pilot`; problem: as that was called with."""
-    kept = about["pilot"]
+def job_of(store: Store, problem: Problem, own_directions: bool, options: MapOptions, data: MapData | None) -> Job:
+    """The work of a map by what a store keeps of its pilot, see `fit_pilot`; problem: as that was called with."""
+    kept, group = store.attributes["pilot"], store.load_group(PILOT)
+    assert group is not None
+    arrays, _ = group
     if kept["floor"] is not None:
         problem = replace(problem, noise=replace(problem.noise, floor=kept["floor"]))
     if kept["transport"] is not None:
         problem = replace(problem, transport=transport_from_dict(kept["transport"]))
     if problem.instrument is not None:
         problem = replace(problem, instrument=replace(problem.instrument, rings=kept["rings"]))
-    if common := about["common"]:
+    if common := store.attributes["common"]:
         problem = with_common(problem, {name: float(one["value"]) for name, one in common.items()})
     emulator = Emulator.of(arrays) if "orders" in arrays else None
     ready, size = map_problem(problem, own_directions, emulator), options.chunk_size
-    return Pilot(problem, emulator, starts_at(ready, arrays["starts"], own_directions, size, kept["poor_above"]))
+    starts = starts_at(ready, arrays["starts"], own_directions, size, kept["poor_above"])
+    return Job(str(store.path.resolve()), problem, emulator, starts, replace(options, progress=None), data)
 
 
 def _numerical_error(ready: Problem, fine: Problem, results: Results, texels: Texels) -> float:
@@ -274,38 +287,3 @@ def predict_all(problem: Problem, vectors: Floats) -> Floats:
 
 def _predict_all(model: Model, vectors: Array) -> Array:
     return jax.lax.map(model.predict, vectors)
-
-
-# ---- for those who do the work ----
-
-
-@dataclass(frozen=True, eq=False)
-class Job:
-    """What all chunks of a map have in common.
-
-    Attributes:
-        path: of the store.
-        pilot: what was found of a sample of the map.
-        options: of the map; its chunk size is that of the program.
-        data: the measurements; None where each task brings its own.
-    """
-
-    path: str
-    pilot: Pilot
-    options: MapOptions
-    data: MapData | None
-
-    def __getstate__(self) -> dict[str, Any]:  # an open store does not outlive its process
-        return {one.name: getattr(self, one.name) for one in fields(self)}
-
-    @cached_property
-    def store(self) -> Store:
-        """The store, opened once in each process."""
-        return Store(self.path)
-
-    def measured(self, block: Block, measured: Measured | None) -> Measured:
-        """The measurements of a block; measured: as the task brings them."""
-        if measured is not None:
-            return measured
-        assert self.data is not None
-        return self.data.read(block)

@@ -26,9 +26,6 @@ FIRST = 8
 MOST_PREDICTED = 4
 """Starts that are compared for every texel, where each has directions of its own."""
 
-NEIGHBOUR = -1
-"""Where a texel's best fit began, if not at a start of the list."""
-
 
 @dataclass(frozen=True)
 class Starts:
@@ -45,10 +42,9 @@ class Starts:
 
 
 class Results(NamedTuple):
-    """What is found of M texels: fits, where each began, and which are poor or were fitted again, (M,) each."""
+    """What is found of M texels: fits, and which are poor or were fitted again, (M,) each."""
 
     fits: Fits
-    start: Integers
     poor: Truths
     restarted: Truths
 
@@ -79,24 +75,23 @@ def search(
         neighbours: of each texel, (M, ...), by their places; -1 where there is none.
     """
     order = likeliest(problem, starts, texels, size, options.restarts + 1)
-    start, restarted = order[:, 0].copy(), np.zeros(texels.number, bool)
-    which = None if starts.known is None else start.copy()
-    best = fit_texels(problem, starts.units[start], texels, size, known=starts.known, which=which, fresh=False)
+    which = None if starts.known is None else order[:, 0]
+    best = fit_texels(problem, starts.units[order[:, 0]], texels, size, known=starts.known, which=which, fresh=False)
+    restarted = np.zeros(texels.number, bool)
     limit = explained_chi_square(problem, starts, texels, options)
 
     def poor() -> Truths:
         """Which fits are worse than noise and pilot explain, or have not converged."""
         return ~((reduced_chi_square(best, texels) <= limit) & best.converged)
 
-    def refit(rows: Integers, units: Floats, origins: Integers) -> None:
+    def refit(rows: Integers, units: Floats) -> None:
         if len(rows):
             restarted[rows] = True
-            improved = best.improve(rows, fit_texels(problem, units, texels.rows(rows), size))
-            start[rows[improved]] = origins[improved]
+            best.improve(rows, fit_texels(problem, units, texels.rows(rows), size))
 
     for place in range(1, order.shape[1]):
         rows = np.flatnonzero(poor())
-        refit(rows, starts.units[order[rows, place]], order[rows, place])
+        refit(rows, starts.units[order[rows, place]])
     for _ in range(options.restarts):
         if neighbours is None:
             break
@@ -104,28 +99,21 @@ def search(
         good, cost = np.append(~poor(), False), np.append(best.cost, np.inf)
         rows = np.flatnonzero(poor() & np.any(good[neighbours], axis=1))
         choice = np.argmin(np.where(good[neighbours[rows]], cost[neighbours[rows]], np.inf), axis=1)
-        refit(rows, best.unit[neighbours[rows, choice]], np.full(len(rows), NEIGHBOUR))
-    return Results(best, start, poor() & best.converged, restarted)
+        refit(rows, best.unit[neighbours[rows, choice]])
+    return Results(best, poor() & best.converged, restarted)
 
 
 def reduced_chi_square(fits: Fits, texels: Texels) -> Floats:
     """Chi-square over degrees of freedom, (M,)."""
-    return np.asarray(fits.chi_square) / _freedom(texels, fits.vector.shape[1])
-
-
-def _freedom(texels: Texels, parameters: int) -> Floats:
-    return np.maximum(texels.measurements - parameters, 1).astype(float)
+    return np.asarray(fits.chi_square) / np.maximum(texels.measurements - fits.vector.shape[1], 1)
 
 
 def explained_chi_square(problem: Problem, starts: Starts, texels: Texels, options: MapOptions) -> Floats:
     """The reduced chi-square that noise and the pilot explain, (M,)."""
-    limit = np.full(texels.number, starts.explained)
     if problem.objective == "likelihood" and problem.noise.tails == "gaussian":
-        freedom, where = np.unique(_freedom(texels, len(problem.names)), return_inverse=True)
-        limit = np.maximum(limit, (stats.chi2.isf(options.poor_probability, freedom) / freedom)[where])
-    elif not starts.explained:
-        limit[:] = np.inf
-    return limit
+        freedom = np.maximum(texels.measurements - len(problem.names), 1)
+        return np.maximum(starts.explained, stats.chi2.isf(options.poor_probability, freedom) / freedom)
+    return np.full(texels.number, starts.explained or np.inf)
 
 
 def likeliest(problem: Problem, starts: Starts, texels: Texels, size: int, most: int) -> Integers:

@@ -75,8 +75,8 @@ class Half(NamedTuple):
 
 def work(job: Job, task: Half) -> tuple[Floats, Floats]:
     """Fit texels given their neighbours: vectors and errors, (M, P), NaN where there is no finite fit."""
-    problem = job.pilot.problem
-    rows = job.pilot.texels(job.measured(task.block, task.measured)).rows(task.places)
+    problem = job.problem
+    rows = job.texels(job.measured(task.block, task.measured)).rows(task.places)
     rows = rows._replace(centre=task.centre, inverse_sd=task.inverse_sd)
     best = fit_texels(problem, task.units, rows, job.options.chunk_size, fresh=False)
     errors, finite = standard_errors(problem, best, rows)[0], best.finite[:, None]
@@ -93,7 +93,7 @@ def smooth_map(store: Store, job: Job, data: MapData, client: Any, options: MapO
         ValueError: measurements that cannot be read again: they are named, and what was done of whole rounds is kept.
         OSError: of the store.
     """
-    names, problem, prior = store.names, job.pilot.problem, options.spatial_prior
+    names, problem, prior = store.names, job.problem, options.spatial_prior
     assert prior is not None
     scales = prior.scales(names)
     said = {"kind": prior.kind, "scale": scales, "rounds": prior.rounds, "settled": options.settled}

@@ -1,7 +1,7 @@
 """The store of a fitted map: a group of zarr that grows chunk by chunk, read by `FittedMap` and written by `Store`.
 
 A directory of zarr version 3 with the arrays ``values/NAME``, ``errors/NAME``, ``reduced_chi_square``, ``flags``,
-``start``, ``at_bound`` and ``measurements``, all of the map's shape, in chunks of the same texels, uncompressed and
+``at_bound`` and ``measurements``, all of the map's shape, in chunks of the same texels, uncompressed and
 with zarr's checksums; and the groups ``pilot`` and, with a spatial prior, ``smoothed``. The flags of a chunk are
 written last: a texel whose flags are 0 is not there yet, whatever else is. One process at a time writes (it holds a
 lock); readers change nothing.
@@ -25,12 +25,12 @@ from zarr.core.sync import sync
 from fits._files import given_path, named, plain, require_there
 from fits._lazy import shown_by
 from fits.engines import one_line
-from fits.maps.inputs import UNREADABLE, Block
+from fits.maps.inputs import Block
 from fits.store import another, differences
 
 Floats = NDArray[np.float64]
 
-KEY, KIND, FORMAT = "layerjax", "fitted map", 5
+KEY, KIND = "layerjax", "fitted map"
 PILOT, SMOOTHED = "pilot", "smoothed"
 PARTIAL = ".partial"
 """How names end, here and in zarr, of what has not been written to its end."""
@@ -48,14 +48,10 @@ FLAGS = {
 }
 """Meaning and bit of what `flags` says of a texel; 0: it is not there yet."""
 
-NO_START = -32768
-"""In ``start``: the texel is not fitted. Others: -1 a neighbour's values, else the number of the start."""
-
 CHECKSUM = (Crc32cCodec(),)
 
 DESCRIPTIONS: dict[str, dict[str, Any]] = {
     "reduced_chi_square": {"long_name": "chi-square per degree of freedom"},
-    "start": {"long_name": f"start of the best fit; -1: a neighbour's values, {NO_START}: none"},
     "at_bound": {"long_name": "bit p: parameter p, in the order of the root's names, is at a bound"},
     "measurements": {"long_name": "how many measurements entered"},
     "flags": {"flag_masks": list(FLAGS.values()), "flag_meanings": " ".join(FLAGS)},
@@ -69,7 +65,6 @@ def arrays_of(names: Sequence[str]) -> dict[str, tuple[np.dtype, Any]]:
     return {
         **{f"{group}/{name}": (number, np.nan) for group in ("values", "errors") for name in names},
         "reduced_chi_square": (number, np.nan),
-        "start": (np.dtype(np.int16), NO_START),
         "at_bound": (np.dtype(np.uint32), 0),
         "measurements": (np.dtype(np.uint32), 0),
         "flags": (np.dtype(np.uint16), 0),
@@ -103,10 +98,7 @@ class FittedMap:
 
     def __init__(self, path: str | Path, mode: Any = "r"):
         self.path = given_path("path", path)
-        self.attributes = _attributes(self.path)
-        about = self.attributes
-        if about.get("format") != FORMAT:
-            raise ValueError(f"{path}: is version {about.get('format')} of the format, must be {FORMAT}")
+        self.attributes = about = _attributes(self.path)
         try:
             self.names, self.units = tuple(about["names"]), dict(about["units"])
             self.shape, self.chunk = tuple(about["shape"]), tuple(about["chunk"])
@@ -160,11 +152,6 @@ class FittedMap:
     def flags(self) -> NDArray[np.uint16]:
         """The state of every texel, in bits (see `has`); 0: it is not there yet."""
         return self.read("flags")
-
-    @property
-    def start(self) -> NDArray[np.int16]:
-        """Which start the best fit came from; -1: a neighbour's values, -32768: it is not fitted."""
-        return self.read("start")
 
     @property
     def at_bound(self) -> NDArray[np.uint32]:
@@ -224,7 +211,7 @@ class FittedMap:
         return f"<FittedMap of {size} texels, {100.0 * self.done:.4g} % done: {', '.join(self.names)}; {self.path}>"
 
     def _repr_html_(self) -> str:
-        return str(shown_by("fits.maps.report.summary:fragment", self))
+        return str(shown_by("fits.maps.report:fragment", self))
 
 
 class _Arrays(Mapping[str, Floats]):
@@ -319,39 +306,44 @@ class Store(FittedMap):
         place, new = self.path / name, self.path / f"{name}{PARTIAL}"
         with named(self.path):
             shutil.rmtree(new, ignore_errors=True)
-            try:
-                group = self.root.create_group(new.name)
-                for path, array in arrays.items():
-                    group.create_array(path, data=np.ascontiguousarray(array), compressors=CHECKSUM, **options)
-                group.attrs.update({KEY: {"arrays": list(arrays), **plain(about)}})
-            except BaseException:
-                shutil.rmtree(new, ignore_errors=True)
-                raise
+            _write_group(self.root, new.name, arrays, about, **options)
             shutil.rmtree(place, ignore_errors=True)
             os.rename(new, place)
 
     def load_group(self, name: str) -> tuple[dict[str, np.ndarray], dict[str, Any]] | None:
-        """The arrays of a group and what it says of itself; None where it is not there whole, or damaged."""
+        """The arrays of a group and what it says of itself; None where it is not there. ValueError: it is damaged."""
+        if not (self.path / name).exists():
+            return None
         try:
             group: Any = self.root[name]
             about: Any = group.attrs[KEY]
             return {path: np.asarray(group[path][...]) for path in about["arrays"]}, about
-        except Exception:  # codecs raise what they like
-            return None
+        except Exception as error:  # codecs raise what they like
+            raise ValueError(f"{self.path}/{name}: damaged, {one_line(error)}; --force begins anew") from None
 
 
-def create(path: Path, attributes: Mapping[str, Any]) -> Store:
-    """Make an empty store, whole or not at all, in place of what is there.
+def _write_group(
+    root: zarr.Group, name: str, arrays: Mapping[str, np.ndarray], about: Mapping[str, Any], **options: Any
+) -> None:
+    group = root.create_group(name)
+    for path, array in arrays.items():
+        group.create_array(path, data=np.ascontiguousarray(array), compressors=CHECKSUM, **options)
+    group.attrs.update({KEY: {"arrays": list(arrays), **plain(about)}})
+
+
+def create(path: Path, attributes: Mapping[str, Any], pilot: Mapping[str, np.ndarray]) -> Store:
+    """Make a store without texels, whole or not at all, in place of what is there.
 
     attributes: what the root says under the key "layerjax": the names of the parameters, at most 32 (the bits of
     ``at_bound``), their units, the shape and the chunk (texels along each axis) of the map, and how it was fitted.
+    pilot: arrays that all chunks are fitted with.
     """
     names, units, shape = attributes["names"], attributes["units"], tuple(attributes["shape"])
     axes = {1: ["texel"], 2: ["row", "column"]}.get(len(shape), [f"axis_{axis}" for axis in range(len(shape))])
-    new, old = _scratch(path)
+    new = _scratch(path)
     with named(path):
         try:
-            root = zarr.create_group(new, attributes={KEY: plain({**attributes, "kind": KIND, "format": FORMAT})})
+            root = zarr.create_group(new, attributes={KEY: plain({**attributes, "kind": KIND})})
             for name, (dtype, fill) in arrays_of(names).items():
                 root.create_array(
                     name,
@@ -363,43 +355,37 @@ def create(path: Path, attributes: Mapping[str, Any]) -> Store:
                     dimension_names=axes,
                     attributes=DESCRIPTIONS.get(name) or {"units": units[name.partition("/")[2]]},
                 )
+            _write_group(root, PILOT, pilot, {})
         except BaseException:
             shutil.rmtree(new, ignore_errors=True)
             raise
-        if os.path.lexists(path):
-            os.rename(path, old)
+        if path.exists():
+            shutil.rmtree(path)
         os.rename(new, path)
-        shutil.rmtree(old, ignore_errors=True)
     return Store(path)
 
 
-def resume(path: Path, identity: Mapping[str, str], measurements: Sequence[str], force: bool) -> Store | None:
+def resume(path: Path, identity: Mapping[str, str], force: bool) -> Store | None:
     """The store that is there, if it is of the same fit, without what killed writers left; None: there is none, or one
     to be replaced.
 
     Args:
         identity: fingerprints of what makes this fit, by name.
-        measurements: those of the data, part by part.
         force: replace a map of another fit, or a damaged one.
 
     Raises:
         ValueError: something else is there, or a map of another fit (it names what differs), or a damaged one.
     """
-    for unfinished in _scratch(path):
-        shutil.rmtree(unfinished, ignore_errors=True)
+    shutil.rmtree(_scratch(path), ignore_errors=True)
     if not os.path.lexists(path):
         return None
     _attributes(path)  # what is not ours is never touched
     try:
         store = Store(path)
-        stored = store.attributes["measurements"]
-        different = differences(store.attributes["fingerprints"], identity)
-        same = len(stored) == len(measurements) and all(
-            one == other or UNREADABLE in (one, other) for one, other in zip(stored, measurements, strict=True)
-        )
-        if different or not same:
-            words = ", ".join(filter(None, (different, "" if same else "measurements")))
+        if words := differences(store.attributes["fingerprints"], identity):
             raise ValueError(f"{another(path, words)}; --force, or force=True, throws it away and begins anew")
+        if store.load_group(PILOT) is None:
+            raise ValueError(f"{path}/{PILOT}: damaged, it is not there; --force begins anew")
     except ValueError:
         if force:
             return None
@@ -408,6 +394,6 @@ def resume(path: Path, identity: Mapping[str, str], measurements: Sequence[str],
     return store
 
 
-def _scratch(path: Path) -> tuple[Path, Path]:
-    """Where a store is made, and where one goes that is thrown away: of the one process that holds the lock."""
-    return path.with_name(f".{path.name}.new{PARTIAL}"), path.with_name(f".{path.name}.old{PARTIAL}")
+def _scratch(path: Path) -> Path:
+    """Where a store is made by the one process that holds the lock."""
+    return path.with_name(f".{path.name}.new{PARTIAL}")

@@ -99,7 +99,7 @@ KEYWORDS = {
     "render": ({"stack": PLAIN}, "stack size"),
     "fit_files": (
         {"files": "a.csv", "stacks": "a.toml", "out": "there"},
-        "files stacks out processes search read_options* starts seed progress*",
+        "files stacks out processes read_options* starts seed progress*",
     ),
     "fit_map": ({"stack": STACK, "geometry": VIEW, "values": DATA.values[None], "out": "there.zarr"}, "out options"),
     "Joint": ({}, "parts"),
@@ -114,7 +114,7 @@ KEYWORDS = {
     ),
     "ComparisonOptions": ({}, " ".join(one.name for one in dataclasses.fields(fits.ComparisonOptions))),
     "ReportOptions": ({}, " ".join(one.name for one in dataclasses.fields(fits.ReportOptions))),
-    "SearchOptions": ({}, "layers starts beam cross_validated bic_gain budget* fit"),
+    "SearchOptions": ({}, "layers starts beam cross_validated bic_gain fit"),
     "MapOptions": ({}, "starts seed emulator* processes"),
 }
 """By function: what is given besides, and the arguments that are wrong; * after those which may be None."""

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fits.maps.store import FLAGS, NO_START, FittedMap, blocks_of, create, open_map
+from fits.maps.store import FLAGS, FittedMap, blocks_of, create, open_map
 
 NAMES = ("layers[0].thickness", "layers[0].phase.alpha", "base.albedo")
 UNITS = dict(zip(NAMES, ("optical depth", "1", "1"), strict=True))
@@ -39,7 +39,6 @@ def numbers(shape: tuple[int, ...], seed: int = 0) -> dict[str, np.ndarray]:
         f"errors/{NAMES[1]}": np.full(shape, 0.02),
         f"errors/{NAMES[2]}": 0.005 + 0.001 * rng.random(shape),
         "reduced_chi_square": rng.chisquare(FREEDOM, shape) / FREEDOM,
-        "start": rng.integers(-1, 4, shape).astype(np.int16),
         "at_bound": np.zeros(shape, np.uint32),
         "measurements": np.full(shape, 64, np.uint32),
         "flags": np.full(shape, GOOD, np.uint16),
@@ -51,7 +50,7 @@ def without(found: dict[str, np.ndarray], where: np.ndarray, flag: str) -> None:
     for values in found.values():
         if values.dtype.kind == "f":
             values[where] = np.nan
-    found["start"][where], found["measurements"][where], found["flags"][where] = NO_START, 0, FLAGS[flag]
+    found["measurements"][where], found["flags"][where] = 0, FLAGS[flag]
 
 
 def bounded(found: dict[str, np.ndarray], where: np.ndarray, place: int) -> None:
@@ -67,7 +66,7 @@ def stored(
     """A store of these arrays, of which the first `chunks` chunks are written; more: attributes."""
     shape = found["flags"].shape
     chunk = tuple(map(min, chunk, shape))
-    store = create(path, ATTRIBUTES | {"names": NAMES, "units": UNITS, "shape": shape, "chunk": chunk} | more)
+    store = create(path, ATTRIBUTES | {"names": NAMES, "units": UNITS, "shape": shape, "chunk": chunk} | more, {})
     for block in list(blocks_of(shape, store.chunk))[:chunks]:
         store.write(block, {name: values[block] for name, values in found.items()})
     return open_map(path)

@@ -16,8 +16,9 @@ from benchmarks.measuring.writing import Bar
 from benchmarks.suite.maps import Material, painted
 from fits.maps.inputs import Block, map_data
 from fits.maps.options import MapOptions
-from fits.maps.pilot import Job, assemble, make_prototype, pilot_texels
-from fits.maps.store import PILOT, Store, blocks_of
+from fits.maps.pilot import Job, make_prototype, pilot_texels
+from fits.maps.pilot import job_of as job_of_store
+from fits.maps.store import Store, blocks_of
 
 Floats = NDArray[np.float64]
 
@@ -85,8 +86,6 @@ def stored(
 def job_of(one: StoredMap, chunk: int) -> tuple[Job, list[Block]]:
     """The work of a map that has been fitted, as its workers had it, and the tasks of all chunks."""
     data, store, options = map_data(one.values, one.geometry), Store(one.store), MapOptions(chunk_size=chunk)
-    texels, kept = pilot_texels(data, options.pilot_texels), store.load_group(PILOT)
-    assert kept is not None
+    texels = pilot_texels(data, options.pilot_texels)
     problem = make_prototype(texels, data, one.stack, one.noise, one.transport, options)
-    job = Job(str(one.store), assemble(problem, False, kept[0], store.attributes, options), options, data)
-    return job, list(blocks_of(store.shape, store.chunk))
+    return job_of_store(store, problem, False, options, data), list(blocks_of(store.shape, store.chunk))

@@ -258,7 +258,7 @@ def width_of_pulls(fit: FittedMap, one: StoredMap) -> float:
 
 def emulator_error(job: Job, fit: FittedMap, checked: int) -> float | None:
     """Largest error of the model at the optimum, from the next finer resolution, in standard deviations."""
-    problem = job.pilot.problem
+    problem = job.problem
     transport = problem.transport
     if not isinstance(transport, lj.AddingDoubling):
         return None

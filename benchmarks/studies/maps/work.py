@@ -105,18 +105,18 @@ def empty(shared: Any, task: Any) -> Timed:
 
 def rows_of(job: Job, task: Texelwise) -> Texels:
     """The measurements of those texels."""
-    return job.pilot.texels(job.measured(task.task, None)).rows(list(task.places))
+    return job.texels(job.measured(task.task, None)).rows(list(task.places))
 
 
 def first_starts(job: Job, rows: Texels) -> Floats:
     """Where `fits.fit_map` begins, in the unit box."""
-    chosen = likeliest(job.pilot.problem, job.pilot.starts, rows, job.options.chunk_size, 1)[:, 0]
-    return np.clip(job.pilot.starts.units[chosen], INSIDE, 1.0 - INSIDE)
+    chosen = likeliest(job.problem, job.starts, rows, job.options.chunk_size, 1)[:, 0]
+    return np.clip(job.starts.units[chosen], INSIDE, 1.0 - INSIDE)
 
 
 def scipy_fit(job: Job, row: Texels, unit: Floats) -> float:
     """The cost of scipy's minimum, with compiled residuals and Jacobian, in the unit box, which suits it best."""
-    arrays, (residuals, jacobian) = jax.tree.map(jnp.asarray, row), _compiled(job.pilot.problem)
+    arrays, (residuals, jacobian) = jax.tree.map(jnp.asarray, row), _compiled(job.problem)
     return float(
         least_squares(
             lambda at: np.asarray(residuals(at, arrays)),
@@ -129,7 +129,7 @@ def scipy_fit(job: Job, row: Texels, unit: Floats) -> float:
 
 def costs_at(job: Job, rows: Texels, vectors: Floats) -> Floats:
     """Half sums of squared residuals of texels at their vectors (M, P)."""
-    return np.asarray(job.pilot.problem.call(_costs, vectors, rows), float)
+    return np.asarray(job.problem.call(_costs, vectors, rows), float)
 
 
 def _costs(model: Model, vectors: Array, rows: Texels) -> Array:

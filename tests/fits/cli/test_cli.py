@@ -109,7 +109,7 @@ def test_many_files_are_fitted_as_one_is(work, capsys, monkeypatch):
     many = ["fit-many", "scans", "--stacks", "bare.toml", "--out", "out", "--processes", "1", *how]
     assert main(many) == 1  # one file is broken
     output = capsys.readouterr()
-    for words in ("broken.csv", "failed", "paint.csv", "1 of 2 fits are there", "out/table.csv", "out/report.html"):
+    for words in ("broken.csv", "failed", "paint.csv", "1 of 2 fits are there", "out/table.csv"):
         assert words in output.out
     assert "layerjax: fits 2/2" in output.err
     assert main(["fit", "scans/paint.csv", "--stack", "bare.toml", "--out", "alone", *how]) == 0
@@ -251,14 +251,8 @@ def test_a_warning_for_users_is_one_line_and_shown_once(capsys, monkeypatch):
     assert capsys.readouterr().err == "layerjax: warning: too narrow\nlayerjax: warning: another\n"
 
 
-@pytest.mark.parametrize("processes", [1, 2])
-def test_so_is_one_of_workers(
-    capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, processes: int
-) -> None:
-    """In processes of their own it had been printed by each of them, with the file and the line."""
-    monkeypatch.setitem(
-        commands.COMMANDS, "info", lambda _: len(dict(run(tasks.warned, None, range(3), processes=processes))) - 3
-    )
+def test_so_is_one_of_threads(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(commands.COMMANDS, "info", lambda _: len(dict(run(tasks.warned, None, range(3)))) - 3)
     with warnings.catch_warnings():
         warnings.simplefilter("default")
         assert main(["info", "data.csv"]) == 0

@@ -11,7 +11,6 @@ from fits.cli.parser import main
 from fits.data.geometry import slices
 from fits.maps.options import MapOptions, SpatialPrior
 from fits.maps.store import FLAGS, open_map
-from fits.problem.compilation import cores
 from fits.problem.noise import Noise
 from tests.helpers.commands import refused
 from tests.helpers.map_files import ANGLES, MASK, SIGMA, VALUES, hdf5_file
@@ -64,7 +63,7 @@ def test_defaults_and_options_arrive(place, run):
     assert code == 0
     assert isinstance(given.pop("stack"), lj.Stack)
     assert isinstance(given.pop("transport"), lj.SingleScattering)
-    assert given.pop("options") == MapOptions(processes=cores())
+    assert given.pop("options") == MapOptions()
     places = {"geometry": "view.csv", "values": "map.npy", "out": "coat.zarr", "sigma": None, "mask": None}
     assert given == {**places, "noise": Noise(), "client": None}
     _, given = run(

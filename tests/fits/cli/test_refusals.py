@@ -54,10 +54,8 @@ REFUSALS = (
     ("render fabric --out a.png --size 100000", "size is 100000, must be in [16, 1024]"),
     ("render fabrik --out a.png", "neither a .toml file nor a material of the gallery: window_shade"),
     ("render fabric --out a.jpg", "pictures can be written as .png only"),
-    ("fit-many scans", "neither a stack nor a search is given"),
+    ("fit-many scans", "no stack is given"),
     ("fit-many scans --stacks coat.toml --read strata=flux", "lookup and strata apply to MERL files only"),
-    ("fit-many scans --stacks coat.toml --noise 0.1", "--noise is given without --search"),
-    ("fit-many scans --stacks coat.toml --scale-sd 0", "--scale-sd is given without --search"),
 )
 
 
@@ -94,7 +92,6 @@ MAP, MANY = "fit-map map.npy --stack coat.toml --out coat.zarr", "fit-many scans
         ("simulate --stack coat.toml --incidence 95.5 200 --out x.csv", "200 given, must be a number in [0, 180]"),
         ("export coat.toml --to rgl --wavelengths 1e300 --out x.bsdf", "1e300 given, must be a number in [1, 1e+09]"),
         ("simulate --stack coat.toml --out x.csv --noise -1", "-1 given, must be a number in [0, 1]"),
-        (f"{MANY} --search --noise 5", "5 given, must be a number in [0, 1]"),
         (f"{MANY} --processes 2 --scheduler tcp://x:1", "--scheduler: not allowed with argument --processes"),
         (f"{MAP} --spatial-prior wide", "invalid choice: 'wide'"),
         (f"{MAP} --spatial-prior gaussian --spatial-scale scale=x", "'x' given, must be a number >= 0"),

@@ -106,6 +106,5 @@ def test_any_number_of_texels_is_searched_by_the_same_programs(geometry, noisy, 
     before = _program(True)._cache_size()
     for count in (1, 6, SIZE, SIZE + 1):
         some = search(problem, starts, rows.rows(np.arange(count)), SIZE, DEFAULT)
-        np.testing.assert_array_equal(some.start, whole.start[:count])
         np.testing.assert_allclose(some.fits.cost, whole.fits.cost[:count], rtol=1e-9)
     assert _program(True)._cache_size() == before

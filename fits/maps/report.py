@@ -1,0 +1,377 @@
+"""The report of a fitted map, finished or not: a few numbers, the verdict on it in sentences, and pictures of it.
+
+The thresholds of the verdict are those of the map's `MapOptions`. A map of two axes is drawn as an image, row 0 on top;
+of one axis as an image of one row; of more axes the slice in the middle of the leading ones.
+"""
+
+import html
+import json
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.colors import LogNorm, Normalize
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch
+from scipy.stats import chi2
+
+from fits._files import write_text
+from fits.maps.store import FLAGS, FittedMap, Floats
+from fits.problem.noise import DEFAULT_RELATIVE
+from fits.progress import Progress, silent
+from fits.reports.pages import Table, document, html_table, image, made_with, section
+from fits.reports.pages import verdict as verdict_box
+from fits.reports.plots.data import GREY, LOG_ABOVE, STYLE, as_png
+from fits.reports.tables import with_error
+from fits.reports.verdicts import listed
+
+WORDS = {
+    "fitted": "fitted",
+    "converged": "converged",
+    "at_bound": "at a bound",
+    "poor": "poor: chi-square above what noise and the pilot explain",
+    "restarted": "fitted again from other starts",
+    "masked": "masked",
+    "too_few_measurements": "too few measurements",
+    "failed": "failed: no finite value",
+    "unidentified": "a parameter is unidentified",
+}
+"""The meaning of each flag."""
+
+MADE = ("version", "shape", "chunk", "samples", "channels", "transport", "noise", "options", "pilot", "numerical")
+"""Attributes of a store that a report shows as they are."""
+
+INNER = (1.0, 99.0)  # percentiles between which colours run
+WIDTH = 4.8  # inches
+NO_VALUE = "#d4d4d4"
+
+
+# ---- in numbers ----
+
+
+@dataclass(frozen=True)
+class Summary:
+    """Counts of texels, and quartiles over those that are fitted.
+
+    Attributes:
+        texels, done: texels of the map, and of them those that are fitted or excluded.
+        counts: texels with each flag.
+        at_bound: texels at which each parameter is at a bound.
+        quartiles: of each array of the store, such as "values/base.albedo", where it is finite; NaN if it nowhere is.
+    """
+
+    texels: int
+    done: int
+    counts: dict[str, int]
+    at_bound: dict[str, int]
+    quartiles: dict[str, tuple[float, ...]]
+
+    @property
+    def fitted(self) -> int:
+        """Texels with values."""
+        return self.counts["fitted"]
+
+    @property
+    def converged(self) -> float:
+        """The share of the fitted texels that converged; NaN if none is fitted."""
+        return self.counts["converged"] / self.fitted if self.fitted else np.nan
+
+
+def summarise(map: FittedMap) -> Summary:
+    """The numbers of a map, finished or not; arrays are read one after the other."""
+    flags = map.flags  # first: a texel that has them has everything
+    fitted = (flags & FLAGS["fitted"]) != 0
+    at_bound, quartiles = map.at_bound[fitted], {}
+    for path in map.arrays.keys() - {"flags", "at_bound"}:
+        values = map.read(path)[fitted].astype(float)
+        finite = values[np.isfinite(values)]
+        quartiles[path] = tuple(np.quantile(finite, (0.25, 0.5, 0.75)).tolist()) if finite.size else (np.nan,) * 3
+    return Summary(
+        texels=flags.size,
+        done=int(np.count_nonzero(flags)),
+        counts={name: int(np.count_nonzero(flags & bit)) for name, bit in FLAGS.items()},
+        at_bound={name: int(np.count_nonzero(at_bound & (1 << place))) for place, name in enumerate(map.names)},
+        quartiles=quartiles,
+    )
+
+
+# ---- in sentences ----
+
+
+def noise_words(map: FittedMap) -> list[str]:
+    """That a noise was assumed, where nothing says how large it is."""
+    if not map.attributes.get("noise_assumed"):
+        return []
+    level = f"{100.0 * DEFAULT_RELATIVE:g} %"
+    return [f"No noise is stated: {level} of the model's value is assumed. State it as `relative`, or by `--noise`."]
+
+
+def verdict(summary: Summary, map: FittedMap) -> tuple[list[str], bool]:
+    """How far the map can be relied on, in a few sentences, and whether they are without reservation."""
+    counts, fitted, option = summary.counts, summary.fitted, map.option
+
+    # how much of the map there is, and why the rest is not
+    reasons = {"masked": "masked", "too_few_measurements": "with too few measurements", "failed": "failed"}
+    rest = [f"{counts[flag]:,} {words}" for flag, words in reasons.items() if counts[flag]]
+    parts, sound = ", ".join([f"{fitted:,} are fitted", *rest]), summary.done == summary.texels
+    words = [f"A map of {summary.texels:,} texels: {parts}."]
+    if not sound:
+        done = f"{summary.done:,} of {summary.texels:,} texels ({share(summary.done, summary.texels)}) are done"
+        words = [f"The map is not finished: {done}, and the same command resumes it.", f"Of these, {parts}."]
+    if not fitted:
+        return [*words, "No texel is fitted."], False
+    sound &= counts["converged"] >= option("converged_share") * (fitted + counts["failed"])
+    words.append(f"{share(counts['converged'], fitted)} of the fitted texels converged.")
+
+    # chi-square beside what noise makes of it
+    words += (assumed := noise_words(map))
+    low, median, high = summary.quartiles["reduced_chi_square"]
+    own = [name for name in map.names if name not in map.attributes["common"]]
+    freedom = summary.quartiles["measurements"][1] - len(own)
+    spread = math.sqrt(2.0 / freedom) if freedom > 0 else math.inf
+    far = option("chi_square_sigmas") * spread
+    if math.isfinite(median):
+        words.append(
+            f"Chi-square per degree of freedom is {median:.3g} in the median texel, and between {low:.3g} and "
+            f"{high:.3g} in half of them; the right model with the right noise gives 1 ± {spread:.2g}."
+        )
+        if median > 1.0 + far:
+            words.append("The model does not explain the data to within their noise: the errors are too small.")
+        if median < 1.0 - far:
+            stated = "assumed" if assumed else "stated"
+            words.append(f"The data scatter less than the {stated} noise: the errors are too large.")
+    else:
+        words.append("No texel has a chi-square: there are no more measurements than parameters.")
+    explained = abs(median - 1.0) <= far  # not so for NaN
+
+    # flags; where noise does not explain the pilot, by which texels are flagged, none is said to be good
+    most = sorted(((count, name) for name, count in summary.at_bound.items() if count), reverse=True)[:3]
+    which = f" ({', '.join(f'{name} in {share(count, fitted)}' for count, name in most)})" if most else ""
+    bounded = f"At a bound: {share(counts['at_bound'], fitted)} of the fitted texels{which}."
+    words.append(bounded if counts["at_bound"] else "No texel is at a bound.")
+    most_of_noise = float(chi2.isf(option("poor_probability"), max(freedom, 1.0))) / max(freedom, 1.0)
+    limit = map.attributes["pilot"]["poor_above"]
+    pilot_is_explained = limit <= option("pilot_factor") * most_of_noise
+    if counts["poor"]:
+        poor = share(counts["poor"], fitted)
+        words.append(
+            f"Poor: {poor} of the fitted texels: chi-square is above {limit:.3g}, more than noise and pilot explain."
+        )
+    elif math.isfinite(median):
+        known = pilot_is_explained and median <= 1.0 + far
+        above = "what noise and the pilot explain" if known else f"{limit:.3g}, more than in the pilot"
+        words.append(f"No converged texel {'is poor' if known else 'stands out'}: chi-square is nowhere above {above}.")
+    if counts["unidentified"]:
+        unidentified = share(counts["unidentified"], fitted)
+        words.append(f"In {unidentified} of the fitted texels the data leave a parameter unidentified.")
+    flagged = max(counts[flag] for flag in ("at_bound", "poor", "unidentified"))
+    sound &= explained and pilot_is_explained and flagged <= option("flagged_share") * fitted
+    about_pilot, pilot_is_sound = _of_pilot(map)
+    return words + about_pilot, sound and pilot_is_sound
+
+
+def _of_pilot(map: FittedMap) -> tuple[list[str], bool]:
+    """Sentences on common parameters and the numerical error, and whether they are without reservation."""
+    common, words, sound = map.attributes["common"], [], True
+    if not all(one["converged"] for one in common.values()):
+        words.append("The joint fit of common parameters has not converged: all else is fitted with wrong values.")
+        sound = False
+    if unknown := [name for name, one in common.items() if math.isinf(float(one["error"]))]:
+        words.append(f"The pilot leaves {listed(unknown)}, common to all texels, unidentified.")
+        sound = False
+    if (error := map.numerical_error) is not None:
+        small = error <= map.option("numerical_error")
+        but = "" if small else ": a finer resolution may give other values"
+        words.append(f"The numerical error of the model is at most {error:.2g} standard deviations in the pilot{but}.")
+        sound &= small
+    return words, sound
+
+
+def smoothing_words(map: FittedMap) -> str:
+    """How a map was smoothed, and whether that has settled, in a few sentences; nothing if it was not."""
+    about = map.smoothing
+    if about is None:
+        return ""
+    scales, settled = about["prior"]["scale"], "" if about["settled"] else ": it has not settled"
+    one_scale = len(set(scales.values())) == 1 and scales.keys() == set(map.names)
+    each = f"{scales[map.names[0]]:g}" if one_scale else ", ".join(f"{name} {one:g}" for name, one in scales.items())
+    return (
+        f"Smoothed beside the plain fit by block alternation ({about['prior']['kind'].replace('_', ' ')}, of the "
+        f"bounds: {each}), in {about['rounds']} rounds; in the last one texels moved by at most "
+        f"{about['largest_moves'][-1]:.2g} standard errors{settled}. "
+        "Errors of the smoothed map are conditional on the values of the neighbours."
+    )
+
+
+def share(part: float, whole: float) -> str:
+    """A share in per cent, rounded down to 0.01 %: nearly all is not all."""
+    percent = math.floor(1e4 * part / whole + 1e-6) / 100.0
+    return "< 0.01 %" if part and not percent else f"{percent:.4g} %"
+
+
+# ---- in tables ----
+
+
+def count_table(summary: Summary) -> Table:
+    """How many texels have each flag, and which share of the map."""
+    rows = [("of the map", summary.texels, "")]
+    if summary.done < summary.texels:
+        rows.append(("done so far", summary.done, share(summary.done, summary.texels)))
+    for flag, count in summary.counts.items():
+        if count or flag == "fitted":
+            of_map = flag in ("fitted", "masked", "too_few_measurements", "failed")
+            percent = share(count, summary.texels) if of_map else f"{share(count, summary.fitted)} of the fitted"
+            rows.append((WORDS[flag], count, percent))
+    for name, count in summary.at_bound.items():
+        if count:
+            rows.append((f"at a bound: {name}", count, f"{share(count, summary.fitted)} of the fitted"))
+    return Table("Texels", ("", "texels", "share"), tuple((words, f"{count:,}", part) for words, count, part in rows))
+
+
+def quartile_table(summary: Summary, map: FittedMap) -> Table:
+    """Quartiles over the fitted texels: of each parameter, of its standard error, and of how well texels are fitted."""
+
+    def words(path: str) -> tuple[str, ...]:
+        return tuple(f"{value:.4g}" if math.isfinite(value) else "" for value in summary.quartiles[path])
+
+    rows = [(name, *words(f"values/{name}"), *words(f"errors/{name}"), map.units[name]) for name in map.names]
+    rows.append(("chi2/dof", *words("reduced_chi_square"), "", "", "", "1"))
+    rows.append(("measurements", *words("measurements"), "", "", "", "1"))
+    columns = ("", "25 %", "median", "75 %", "error: 25 %", "error: median", "error: 75 %", "unit")
+    return Table("Quartiles over the fitted texels", columns, tuple(rows), "Of errors, those that are finite.")
+
+
+def common_table(map: FittedMap) -> Table:
+    """The parameters that all texels have in common."""
+    common = map.attributes["common"].items()
+    rows = [(name, *with_error(float(one["value"]), float(one["error"])), one["unit"]) for name, one in common]
+    return Table("Common to all texels", ("parameter", "value", "error", "unit"), tuple(rows))
+
+
+# ---- as a page ----
+
+
+def fragment(map: FittedMap) -> str:
+    """The map in a notebook, as HTML: the verdict, and the median of every parameter."""
+    summary = summarise(map)
+    table = html_table(quartile_table(summary, map)) if summary.fitted else ""
+    return f"<p>{html.escape(' '.join(verdict(summary, map)[0]))}</p>{table}"
+
+
+def report(map: FittedMap, path: str | Path, force: bool = True, progress: Progress = silent) -> Summary:
+    """Write the report of a map to `path`, whole or not at all; returns its numbers.
+
+    Raises:
+        ValueError: `path` exists and `force` is False, or a chunk of the map is damaged.
+    """
+    numbers, title = summarise(map), f"Map of {map.path.resolve().name}"
+    body = [f"<h1>{html.escape(title)}</h1>", verdict_box(*verdict(numbers, map))]
+    flags = _figures(map, ("The gravest flag of each texel.", flag_picture(map.flags)))
+    body.append(section("Texels", flags, count_table(numbers)))
+    if numbers.fitted:
+        common = common_table(map)
+        body.append(section("Values in short", quartile_table(numbers, map), common if common.rows else None))
+        parts = ['<p class="note">Colours run over the middle 98 % of the values.</p>']
+        parts.append(f"<p>{html.escape(smoothing_words(map))}</p>")
+        for number, name in enumerate(map.names):
+            progress("pictures", number, len(map.names), name)
+            unit, norm = "unitless" if map.units[name] == "1" else map.units[name], inner_norm(map.values[name])
+            parts.append(f"<h3>{html.escape(name)}</h3>")
+            plain, smoothed = (map.values, map.errors, "over the map"), (map.smoothed, map.smoothed_errors)
+            for values, errors, words in (plain, (*smoothed, "with a spatial prior")):
+                if values is not None and errors is not None:
+                    value = value_picture(values[name], name, unit, "viridis", norm)
+                    error = value_picture(errors[name], f"error of {name}", unit, "plasma", inner_norm(errors[name]))
+                    captions = f"{name}, {words}.", f"Standard error of {name}, {words}."
+                    parts.append(_figures(map, *zip(captions, (value, error), strict=True)))
+        progress("pictures", len(map.names), len(map.names))
+        ratio, words = map.reduced_chi_square, "chi-square per degree of freedom"
+        chi_square = value_picture(ratio, words, "χ² / degree of freedom", "viridis", inner_norm(ratio))
+        fit = _figures(map, (f"{words.capitalize()}; 1: as the noise makes it.", chi_square))
+        body += [section("Values and errors", *parts), section("Goodness of fit", fit)]
+    made = {name: map.attributes[name] for name in MADE if name in map.attributes}
+    texts = (str(map.path), json.dumps(made, indent=1), str(map.attributes.get("stack", "")))
+    body += [section("How it was made", *(f"<pre>{html.escape(text)}</pre>" for text in texts)), made_with()]
+    write_text(path, document(title, body), force=force)
+    return numbers
+
+
+def _figures(map: FittedMap, *figures: tuple[str, Figure]) -> str:
+    """Pictures beside each other, with what each shows."""
+    leading = [size // 2 for size in map.shape[:-2]]
+    part = f" Slice {leading} of {' x '.join(str(size) for size in map.shape[:-2])}." if leading else ""
+    shown = (image({"": as_png(figure, trimmed=False)}, "", f"{words}{part}") for words, figure in figures)
+    return f'<div class="pair">{"".join(shown)}</div>'
+
+
+# ---- pictures ----
+
+
+def value_picture(values: Floats, title: str, label: str, colours: str, norm: Normalize) -> Figure:
+    """One number of every texel, such as a parameter or its error; grey where it is not finite.
+
+    Args:
+        values: of the whole map.
+        title, label: what stands above, and what the numbers are, with their unit.
+        colours, norm: of matplotlib.
+    """
+    finite, cmap = np.isfinite(values), mpl.colormaps[colours].with_extremes(bad=NO_VALUE)
+    legend = {} if finite.all() else {NO_VALUE: "no value"}
+    return _map_picture(np.where(finite, values, np.nan), title, legend, label, cmap=cmap, norm=norm)
+
+
+def inner_norm(values: Floats) -> Normalize:
+    """Colours over the middle 98 %; logarithmic where these span more than a factor of ten."""
+    finite = values[np.isfinite(values)]
+    low, high = np.percentile(finite, INNER).tolist() if finite.size else (0.0, 1.0)
+    if not low < high:  # one value nearly everywhere
+        low, high = low - (0.01 * abs(low) or 0.01), high + (0.01 * abs(high) or 0.01)
+    return LogNorm(low, high) if 0.0 < low * LOG_ABOVE < high else Normalize(low, high)
+
+
+STATES = (
+    ("not done yet", "#ffffff", 0, 0xFFFF),
+    ("masked", NO_VALUE, FLAGS["masked"], 0),
+    ("too few measurements", GREY, FLAGS["too_few_measurements"], 0),
+    ("failed", "#000000", FLAGS["failed"], 0),
+    ("not converged", "#D55E00", FLAGS["fitted"], FLAGS["converged"]),
+    ("poor", "#E69F00", FLAGS["poor"], 0),
+    ("unidentified", "#CC79A7", FLAGS["unidentified"], 0),
+    ("at a bound", "#56B4E9", FLAGS["at_bound"], 0),
+    ("good, from other starts", "#009E73", FLAGS["restarted"], 0),
+    ("good", "#cfe8dc", 0, 0),
+)
+"""How a texel is shown: in words, its colour, the flags that it has, and those that it has not; the first one that
+applies."""
+
+
+def flag_picture(flags: np.ndarray) -> Figure:
+    """The gravest flag of every texel, with counts over the whole map."""
+    states = np.argmax([((flags & bits) == bits) & ((flags & without) == 0) for _, _, bits, without in STATES], axis=0)
+    counts, colours = np.bincount(states.ravel(), minlength=len(STATES)), [colour for _, colour, *_ in STATES]
+    legend = {colour: f"{words}: {count:,}" for (words, colour, *_), count in zip(STATES, counts, strict=True) if count}
+    norm, cmap = Normalize(-0.5, len(STATES) - 0.5), mpl.colors.ListedColormap(colours)
+    return _map_picture(states, "flags of the texels", legend, cmap=cmap, norm=norm)
+
+
+def _map_picture(values: np.ndarray, title: str, legend: dict[str, str], label: str = "", **colours: Any) -> Figure:
+    """An image with axes in texels; label: of the bar of colours; legend: words by colour."""
+    values = np.atleast_2d(values[tuple(size // 2 for size in values.shape[:-2])])
+    rows, columns = values.shape
+    height = float(np.clip(0.78 * WIDTH * rows / columns + 0.7, 1.8, 7.0)) + 0.2 * len(legend)
+    with mpl.rc_context(STYLE | {"axes.grid": False}):
+        figure = Figure(figsize=(WIDTH, height), layout="constrained")
+        axes = figure.subplots()
+        shown = axes.imshow(
+            values, aspect="equal" if 1 / 6 < rows / columns < 6 else "auto", interpolation="nearest", **colours
+        )
+        axes.set(title=title, xlabel="column", ylabel="row")
+        if label:
+            figure.colorbar(shown, ax=axes, label=label)
+        if legend:
+            handles = [Patch(facecolor=colour, edgecolor=GREY, label=words) for colour, words in legend.items()]
+            figure.legend(handles=handles, loc="outside lower center", ncols=2 if len(handles) > 1 else 1)
+    return figure
