@@ -6,8 +6,8 @@ was being written and no other. SQLite's rollback journal is used, not its write
 network file systems.
 
 One process writes, and holds a lock file beside the store while it does. Readers take a copy: they need no lock, change
-nothing, and hold up nobody. Every record carries a checksum, and the store one over all of them, so that damage is
-reported instead of read. A fingerprint says whose work the store holds; the work of another problem is refused.
+nothing, and hold up nobody. Every record carries a checksum, so that damage is reported instead of read. A fingerprint
+says whose work the store holds; the work of another problem is refused.
 
     with Store.open("chain.store", fingerprint(data=values, seed=0)) as store:
         store.put("moves", {"kind": "stretch"})                        # one record a key, the last one counts
@@ -19,6 +19,7 @@ A record is what JSON can hold (lists come back in place of tuples), with numpy 
 instance, arrays (steps, walkers, P) and (steps, walkers) and the state of the random generator.
 """
 
+import base64
 import errno
 import hashlib
 import json
@@ -28,7 +29,7 @@ import tempfile
 import threading
 import zlib
 from collections.abc import Iterator, Mapping
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager, suppress
 from pathlib import Path
 from typing import Any, Self
 
@@ -36,15 +37,19 @@ import numpy as np
 
 from fits._files import locked, require_there
 
-APPLICATION = 0x6C6A7801
+APPLICATION = 0x6C6A7802
 """SQLite's application_id of a store; its last digits are the version of the layout."""
 _LAYOUT = """
-CREATE TABLE head (fingerprint TEXT, total INTEGER, checksum INTEGER);
-CREATE TABLE records (number INTEGER PRIMARY KEY, key TEXT, checksum INTEGER, text TEXT, content BLOB);
+CREATE TABLE records (number INTEGER PRIMARY KEY, key TEXT, checksum INTEGER, text TEXT);
 """
-_ARRAY = "numpy"
+_ARRAY, _WHOSE = "numpy", "fingerprint"
 _NO_ROOM = (sqlite3.SQLITE_FULL, sqlite3.SQLITE_IOERR_WRITE, sqlite3.SQLITE_IOERR_FSYNC, sqlite3.SQLITE_IOERR_TRUNCATE)
-_NO_ACCESS = (sqlite3.SQLITE_READONLY, sqlite3.SQLITE_CANTOPEN, sqlite3.SQLITE_PERM)
+_OF_SYSTEM = {
+    sqlite3.SQLITE_READONLY: errno.EACCES,
+    sqlite3.SQLITE_CANTOPEN: errno.EACCES,
+    sqlite3.SQLITE_PERM: errno.EACCES,
+    sqlite3.SQLITE_IOERR: errno.EIO,
+}
 _LONGEST = 60  # letters of a value that a fingerprint shows
 
 
@@ -59,7 +64,7 @@ class Store:
     def __init__(self, path: Path, connection: sqlite3.Connection):
         self.path = path
         self._connection, self._turn = connection, threading.RLock()
-        self.fingerprint, self._total = self._checked()
+        self.fingerprint: dict[str, str] = self._checked()
 
     @classmethod
     @contextmanager
@@ -119,8 +124,8 @@ class Store:
 
     def keys(self) -> list[str]:
         """Keys of all records, in the order in which they were written."""
-        rows = self._records("SELECT key FROM records ORDER BY number")
-        return list(dict.fromkeys(key for (key,) in rows))
+        rows = self._select("SELECT key FROM records ORDER BY number") if self.fingerprint else []
+        return list(dict.fromkeys(key for (key,) in rows if key != _WHOSE))
 
     def get(self, key: str) -> Any:
         """The record of a key, the last one of several; None without any."""
@@ -128,8 +133,8 @@ class Store:
 
     def all(self, key: str) -> list[Any]:
         """The records that were appended to a key."""
-        rows = self._records("SELECT text, content FROM records WHERE key = ? ORDER BY number", key)
-        return [_decoded(text, content) for text, content in rows]
+        rows = self._select("SELECT text FROM records WHERE key = ? ORDER BY number", key) if self.fingerprint else []
+        return [json.loads(text, object_hook=_decoded) for (text,) in rows]
 
     def put(self, key: str, record: Any) -> None:
         """Keep a record in the place of what the key has."""
@@ -140,62 +145,39 @@ class Store:
         self._write(key, record, replace=False)
 
     def _write(self, key: str, record: Any, replace: bool) -> None:
-        text, content = _encoded(record)
-        checksum = _checksum(key, text, content)
-        with self._turn, _errors_of(self.path):
-            total = self._total + checksum
-            with self._connection:  # a transaction
-                if replace:
-                    for (old,) in self._select("SELECT checksum FROM records WHERE key = ?", (key,)):
-                        total -= old
-                    self._connection.execute("DELETE FROM records WHERE key = ?", (key,))
-                self._connection.execute(
-                    "INSERT INTO records (key, checksum, text, content) VALUES (?, ?, ?, ?)",
-                    (key, checksum, text, content),
-                )
-                self._write_head(total)
-            self._total = total
+        text = json.dumps(record, default=_encoded)
+        row = (key, _checksum(key, text), text)
+        with self._turn, _errors_of(self.path), self._connection:  # a transaction
+            if replace:
+                self._connection.execute("DELETE FROM records WHERE key = ?", (key,))
+            self._connection.execute("INSERT INTO records (key, checksum, text) VALUES (?, ?, ?)", row)
 
     def _begin(self, fingerprint: dict[str, str]) -> None:
         """Without records, of this problem."""
         with self._connection:
             self._connection.execute("BEGIN")
-            for statement in ("DROP TABLE IF EXISTS head", "DROP TABLE IF EXISTS records", *_LAYOUT.split(";")):
-                self._connection.execute(statement)
+            self._connection.execute("DROP TABLE IF EXISTS records")
+            self._connection.execute(_LAYOUT)
             self._connection.execute(f"PRAGMA application_id = {APPLICATION}")
-            self.fingerprint, self._total = fingerprint, 0
-            self._connection.execute("INSERT INTO head VALUES ('', 0, 0)")
-            self._write_head(0)
+            self.fingerprint = fingerprint
+            self._write(_WHOSE, fingerprint, replace=True)
 
-    def _write_head(self, total: int) -> None:
-        text = json.dumps(self.fingerprint)
-        head = (text, total, _checksum(text, str(total), b""))
-        self._connection.execute("UPDATE head SET fingerprint = ?, total = ?, checksum = ?", head)
-
-    def _checked(self) -> tuple[dict[str, str], int]:
-        """The fingerprint and the checksum over all records. ValueError if they are not as they were written."""
+    def _checked(self) -> dict[str, str]:
+        """The fingerprint. ValueError if records are not as they were written."""
         ((application,),), tables = self._select("PRAGMA application_id"), self._select("SELECT * FROM sqlite_schema")
         if not application and not tables:
-            return {}, 0  # killed before it was begun
-        if application != APPLICATION or self._select("PRAGMA quick_check") != [("ok",)]:
+            return {}  # killed before it was begun
+        if application != APPLICATION or self._select("PRAGMA integrity_check") != [("ok",)]:
             raise ValueError(damaged(self.path))
-        text, total, checksum = self._select("SELECT fingerprint, total, checksum FROM head")[0]
-        whole, found = checksum == _checksum(text, str(total), b""), 0
-        for key, stored, *record in self._connection.execute("SELECT key, checksum, text, content FROM records"):
-            whole &= stored == _checksum(key, *record)
-            found += stored
-        if not whole or found != total:
+        rows = self._connection.execute("SELECT key, checksum, text FROM records ORDER BY number")
+        if not all(stored == _checksum(key, text) for key, stored, text in rows):
             raise ValueError(damaged(self.path))
-        return json.loads(text), total
+        ((whose,),) = self._select("SELECT text FROM records WHERE key = ?", _WHOSE)
+        return json.loads(whose)
 
-    def _records(self, statement: str, *values: str) -> list[Any]:
-        if not self.fingerprint:
-            return []
+    def _select(self, statement: str, *values: str) -> list[Any]:
         with self._turn, _errors_of(self.path):
-            return self._select(statement, values)
-
-    def _select(self, statement: str, values: tuple[Any, ...] = ()) -> list[Any]:
-        return self._connection.execute(statement, values).fetchall()
+            return self._connection.execute(statement, values).fetchall()
 
 
 def holds_other_files(directory: Path, store: str) -> bool:
@@ -267,38 +249,23 @@ def _digest(part: Any) -> str:
     return _DIGEST + found.hexdigest()
 
 
-def _encoded(record: Any) -> tuple[str, bytes]:
-    """A record as JSON, and the numbers of its arrays one after the other."""
-    content = bytearray()
-
-    def place(value: Any) -> dict[str, Any]:
-        array = np.asarray(value)
-        if array.dtype.hasobject:
-            raise TypeError(f"{type(value).__name__} cannot be kept in a store")
-        content.extend(np.ascontiguousarray(array).tobytes())
-        return {_ARRAY: array.dtype.str, "shape": array.shape}
-
-    return json.dumps(record, default=place), bytes(content)
+def _encoded(value: Any) -> dict[str, Any]:
+    """An array as JSON holds it."""
+    array = np.asarray(value)
+    if array.dtype.hasobject:
+        raise TypeError(f"{type(value).__name__} cannot be kept in a store")
+    return {_ARRAY: array.dtype.str, "shape": array.shape, "data": base64.b64encode(array.tobytes()).decode()}
 
 
-def _decoded(text: str, content: bytes) -> Any:
-    begin = 0
-
-    def taken(table: dict[str, Any]) -> Any:
-        nonlocal begin
-        if _ARRAY not in table:
-            return table
-        dtype, shape = np.dtype(table[_ARRAY]), tuple(table["shape"])
-        count = int(np.prod(shape, dtype=int))
-        array = np.frombuffer(content, dtype, count, begin).reshape(shape)
-        begin += count * dtype.itemsize
-        return array.copy() if shape else array[()]
-
-    return json.loads(text, object_hook=taken)
+def _decoded(table: dict[str, Any]) -> Any:
+    if _ARRAY not in table:
+        return table
+    array = np.frombuffer(base64.b64decode(table["data"]), table[_ARRAY]).reshape(table["shape"])
+    return array.copy() if array.shape else array[()]
 
 
-def _checksum(key: str, text: str, content: bytes) -> int:
-    return zlib.crc32(content, zlib.crc32(f"{len(key)} {key} {text}".encode()))
+def _checksum(key: str, text: str) -> int:
+    return zlib.crc32(f"{len(key)} {key} {text}".encode())
 
 
 def _require_store(path: Path) -> None:
@@ -316,16 +283,12 @@ def _copied(path: Path) -> sqlite3.Connection:
         before, content = _state(path), path.read_bytes()
         if _state(path) == before:  # nobody has written in the meantime
             break
-    _, journal = before
     memory = sqlite3.connect(":memory:", check_same_thread=False)
-    if not journal:
-        if content:
-            memory.deserialize(content)
-        return memory
     with tempfile.TemporaryDirectory() as folder:  # SQLite takes back what was not finished
         copy = Path(folder) / "copy"
         copy.write_bytes(content)
-        _journal(copy).write_bytes(journal)
+        if journal := before[1]:
+            _journal(copy).write_bytes(journal)
         with closing(sqlite3.connect(copy)) as connection:
             connection.backup(memory)
     return memory
@@ -333,13 +296,11 @@ def _copied(path: Path) -> sqlite3.Connection:
 
 def _state(path: Path) -> tuple[bytes, bytes]:
     """What every transaction changes: the header, which counts them, and the journal."""
-    journal = _journal(path)
     with open(path, "rb") as file:
         header = file.read(100)
-    try:
-        return header, journal.read_bytes()
-    except FileNotFoundError:
-        return header, b""
+    with suppress(FileNotFoundError):
+        return header, _journal(path).read_bytes()
+    return header, b""
 
 
 def _journal(path: Path) -> Path:
@@ -357,10 +318,8 @@ def _errors_of(path: Path) -> Iterator[None]:
             raise OSError(errno.ENOSPC, "No space left on device, or more than a quota allows", str(path)) from None
         if code == sqlite3.SQLITE_READONLY_DBMOVED:
             raise OSError(errno.ENOENT, "Removed, or replaced, while it was written", str(path)) from None
-        if code & 0xFF in _NO_ACCESS:
-            raise OSError(errno.EACCES, "Permission denied", str(path)) from None
-        if code & 0xFF == sqlite3.SQLITE_IOERR:
-            raise OSError(errno.EIO, "Input/output error", str(path)) from None
+        if code & 0xFF in _OF_SYSTEM:
+            raise OSError(_OF_SYSTEM[code & 0xFF], str(error).capitalize(), str(path)) from None
         raise ValueError(damaged(path)) from None
     except (UnicodeError, TypeError, LookupError):  # what stands there is of another kind
         raise ValueError(damaged(path)) from None

@@ -11,6 +11,7 @@ enough.
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
+from functools import reduce
 from typing import Any
 
 import equinox as eqx
@@ -87,60 +88,25 @@ class Emulator(eqx.Module):
 
     def values(self, vector: Array) -> Array:
         """BSDF of the data, (N, C), in 1/sr, with these parameters (P,)."""
-        return _values(vector, emulator=self)
 
-    def with_slopes(self, vector: Array) -> tuple[Array, Array]:
-        """`values`, and their derivatives by the coordinates' parameters, (N, C, D)."""
-        channels = [self._channel(vector, index) for index in range(self.coefficients.shape[0])]
-        values, slopes = zip(*channels, strict=True)
-        return jnp.stack(values, axis=1), jnp.stack(slopes, axis=1)
+        def channel(places: Array, coefficients: Array, directions: Array, mean: Array, offset: Array) -> Array:
+            at = vector[places]
+            coordinate = jnp.where(self.logarithmic, jnp.log(jnp.where(self.logarithmic, at, 1.0)), at)
+            x = 2.0 * (coordinate - self.low) / (self.high - self.low) - 1.0
+            x += jax.lax.stop_gradient(jnp.clip(x, -1.0, 1.0) - x)  # on a bound a slope does not end
+            basis = chebyshev(x, self.highest + 1)
+            terms = reduce(jnp.multiply, [basis[self.orders[:, k], k] for k in range(places.size)])
+            return jnp.exp(terms @ coefficients @ directions + mean) - offset
 
-    def _channel(self, vector: Array, channel: int) -> tuple[Array, Array]:
-        at = vector[self.places[channel]]
-        tame = jnp.where(self.logarithmic, jnp.clip(at, jnp.exp(self.low), jnp.exp(self.high)), 1.0)
-        coordinate = jnp.where(self.logarithmic, jnp.log(tame), at)
-        width = self.high - self.low
-        x = jnp.clip(2.0 * (coordinate - self.low) / width - 1.0, -1.0, 1.0)
-        rate = 2.0 / width * jnp.where(self.logarithmic, 1.0 / tame, 1.0)
-        of_data = self._products(x) @ self.coefficients[channel] @ self.directions[channel]
-        total = jnp.exp(of_data[0] + self.mean[channel])
-        return total - self.offset[channel], (of_data[1:] * rate[:, None] * total).T
-
-    def _products(self, x: Array) -> Array:
-        """The M terms at x (D,), then their derivatives by each coordinate, (1 + D, M)."""
-        parts = [chebyshev(x[place], self.highest + 1) for place in range(x.size)]
-        basis, slope = ([part[which][self.orders[:, place]] for place, part in enumerate(parts)] for which in (0, 1))
-        before = [jnp.ones(len(self.orders), x.dtype)]
-        for factor in basis:
-            before.append(before[-1] * factor)
-        rows, after = [], jnp.ones_like(before[0])
-        for place in reversed(range(x.size)):
-            rows.append(before[place] * slope[place] * after)
-            after = after * basis[place]
-        return jnp.stack([before[-1], *reversed(rows)])
+        return jax.vmap(channel, out_axes=1)(self.places, self.coefficients, self.directions, self.mean, self.offset)
 
 
-def chebyshev(x: Array, count: int) -> tuple[Array, Array]:
-    """The first polynomials at x in [-1, 1], and their derivatives, (count,) each."""
-    basis, second = [jnp.ones_like(x), x], [jnp.ones_like(x), 2.0 * x]
+def chebyshev(x: Array, count: int) -> Array:
+    """The first polynomials at x (D,) in [-1, 1], (count, D)."""
+    basis = [jnp.ones_like(x), x]
     for _ in range(2, count):
         basis.append(2.0 * x * basis[-1] - basis[-2])
-        second.append(2.0 * x * second[-1] - second[-2])
-    slope = [jnp.zeros_like(x)] + [k * second[k - 1] for k in range(1, count)]
-    return jnp.stack(basis[:count]), jnp.stack(slope[:count])
-
-
-@eqx.filter_custom_jvp
-def _values(vector: Array, *, emulator: Emulator) -> Array:
-    """All derivatives come at once, and are little more than a value: a Jacobian takes its columns from them."""
-    return emulator.with_slopes(vector)[0]
-
-
-@_values.def_jvp
-def _(primals: tuple[Array], tangents: tuple[Array], *, emulator: Emulator) -> tuple[Array, Array]:
-    (vector,), (moved,) = primals, tangents
-    values, slopes = emulator.with_slopes(vector)
-    return values, jnp.einsum("ncd,cd->nc", slopes, moved[emulator.places])
+    return jnp.stack(basis[:count])
 
 
 class EmulatedModel(Model):

@@ -60,7 +60,9 @@ def _array(source: Any, where: str) -> xr.DataArray:
     """An array of numpy, h5py, zarr or xarray, or what numpy makes one of, under the name that errors call it."""
     if isinstance(source, xr.DataArray | xr.Variable):
         variable = source if isinstance(source, xr.Variable) else source.variable
-        unnamed = [(name, f"dim_{axis}") for axis, name in enumerate(variable.dims) if str(name).startswith("phony_dim")]
+        unnamed = [
+            (name, f"dim_{axis}") for axis, name in enumerate(variable.dims) if str(name).startswith("phony_dim")
+        ]
         variable = variable.to_base_variable()._replace(dims=[dict(unnamed).get(name, name) for name in variable.dims])
     else:
         array = source if hasattr(source, "dtype") and hasattr(source, "shape") else np.asarray(source)

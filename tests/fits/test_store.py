@@ -30,7 +30,7 @@ with Store.open(path, fingerprint(data=np.arange(3.0), seed=0)) as store:
             with store._connection:
                 store._connection.execute("PRAGMA cache_size = 1")  # pages go to the file before the end
                 for _ in range(50):
-                    store._connection.execute("UPDATE records SET content = zeroblob(20000), checksum = 0")
+                    store._connection.execute("UPDATE records SET text = hex(zeroblob(20000)), checksum = 0")
                 os.kill(os.getpid(), signal.SIGSTOP)
 """
 

@@ -62,16 +62,18 @@ def test_values_are_those_of_the_transport_within_a_tenth_of_the_noise(problem, 
 
 
 def test_derivatives_are_those_of_the_emulator(emulated, vectors):
+    """Inside, and on the bounds, where they do not end."""
     predict = jax.jit(lambda vector: emulated.model.predict(vector))
-    by_columns, by_rows = jax.jit(jax.jacfwd(predict)), jax.jit(jax.jacrev(predict))
-    for vector in (jnp.asarray(vectors[7]), jnp.asarray(emulated.low), jnp.asarray(emulated.high)):
-        np.testing.assert_allclose(by_columns(vector), by_rows(vector), rtol=1e-9, atol=1e-12)
-    inside, step = jnp.asarray(vectors[7]), 1e-5
-    slopes = np.asarray(by_columns(inside))
-    for place in range(inside.size):
-        moved = [predict(inside.at[place].add(sign * step)) for sign in (1.0, -1.0)]
-        # central differences: rounding of 1e-16 / 1e-5 and a third derivative of about 100 times 1e-10
-        np.testing.assert_allclose(slopes[..., place], (moved[0] - moved[1]) / (2 * step), rtol=1e-5, atol=1e-7)
+    slopes_at, step = jax.jit(jax.jacfwd(predict)), 1e-5
+    for vector, inward in ((vectors[7], 0.0), (emulated.low, 1.0), (emulated.high, -1.0)):
+        vector, slopes = jnp.asarray(vector), np.asarray(slopes_at(jnp.asarray(vector)))
+        for place in range(vector.size):
+            ends = (1.0, -1.0) if not inward else (inward, 0.0)
+            moved = [predict(vector.at[place].add(sign * step)) for sign in ends]
+            expected = (moved[0] - moved[1]) / ((ends[0] - ends[1]) * step)
+            # differences: rounding of 1e-16 / 1e-5, and a further derivative of about 100 times the step
+            np.testing.assert_allclose(slopes[..., place], expected, rtol=1e-5 if not inward else 2e-2, atol=1e-5)
+    slopes = np.asarray(slopes_at(jnp.asarray(vectors[7])))
     first, second = (emulated.names.index(name) for name in NAMES[1:])  # each channel has its own
     assert np.all(slopes[:, 0, second] == 0.0)
     assert np.all(slopes[:, 1, first] == 0.0)
@@ -79,11 +81,8 @@ def test_derivatives_are_those_of_the_emulator(emulated, vectors):
 
 
 def test_chebyshev_polynomials_are_cosines():
-    exact = np.polynomial.chebyshev.chebder(np.eye(6))
-    for x in (-1.0, -0.3, 0.0, 0.8, 1.0):
-        basis, slope = chebyshev(jnp.asarray(x), 6)
-        np.testing.assert_allclose(basis, np.cos(np.arange(6) * np.arccos(x)), atol=1e-12)
-        np.testing.assert_allclose(slope, np.polynomial.chebyshev.chebval(x, exact), atol=1e-12)
+    x = np.array([-1.0, -0.3, 0.0, 0.8, 1.0])
+    np.testing.assert_allclose(chebyshev(jnp.asarray(x), 6), np.cos(np.arange(6)[:, None] * np.arccos(x)), atol=1e-12)
 
 
 def test_too_dear_an_emulator_is_not_made(problem):
