@@ -13,7 +13,6 @@ from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
-from functools import partial
 from itertools import pairwise
 from numbers import Real
 from pathlib import Path
@@ -26,7 +25,6 @@ from fits._files import given_path
 from fits._files import named as errors_named
 from fits.data.measurements import TO_HAVE_THEM, Measurements
 from fits.optimise.fit import fit as run_fit
-from fits.optimise.fit import fit_with_discrepancy, needs_discrepancy, undecided, without_discrepancy
 from fits.optimise.options import DEFAULT, FitOptions
 from fits.optimise.result import Fit
 from fits.prediction.cross_validation import CrossValidation, ModelScore, out_of_sample, rank_models
@@ -177,13 +175,9 @@ class SearchOptions:
     fit: FitOptions = DEFAULT
 
     def __post_init__(self) -> None:
-        for name, low, high in (
-            ("layers", 0, 6),
-            *((one, 1, math.inf) for one in ("starts", "beam", "cross_validated")),
-        ):
-            number = getattr(self, name)
-            if not (isinstance(number, int) and low <= number <= high):
-                raise ValueError(f"{name} is {in_short(number)}; it must be a whole number in [{low}, {high}]")
+        require_count("layers", self.layers, 0, 6)
+        for name in ("starts", "beam", "cross_validated"):
+            require_count(name, getattr(self, name), 1)
         if not (isinstance(self.bic_gain, Real) and 0.0 <= float(self.bic_gain) < math.inf):
             raise ValueError(f"bic_gain is {in_short(self.bic_gain)}; it must be a finite number of at least 0")
         require_kind("fit", self.fit, FitOptions)
@@ -308,7 +302,7 @@ def search(
             coarse |= work.in_parallel(f"{len(level[0]) - 1} layers", work.fit_coarsely, level)
             # those of the lowest BIC as `fits.fit` fits them, cross-validated
             best_of_level = sorted(level, key=lambda one: _bic(coarse[one]))[: options.cross_validated]
-            full |= work.in_parallel("cross-validation", partial(work.cross_validate, coarse), best_of_level)
+            full |= work.in_parallel("cross-validation", work.cross_validate, best_of_level)
             # a level that neither predicts better nor lowers the BIC clearly is the last
             ahead = not leader or _scores(full)[named(leader[0])].clear_diff > 0.0
             if not ahead and not min(map(_bic, coarse.values())) < lowest - options.bic_gain:
@@ -349,23 +343,14 @@ class _Work(NamedTuple):
 
     def fit_coarsely(self, structure: Structure) -> Fit:
         """The fit with independent noise at a coarse resolution."""
-        return self._load_or_fit(
-            structure, "", lambda: self._fit(self._problem(structure, independent=True), screen=True)
-        )
+        problem = Problem(self.library.stack(structure), self.data, **self.settings)
+        problem = replace(problem, noise=replace(problem.noise, discrepancy=False))
+        return self._load_or_fit(structure, "", problem, screen=True)
 
-    def cross_validate(self, coarse: Mapping[Structure, Fit], structure: Structure) -> _CrossValidated:
+    def cross_validate(self, structure: Structure) -> _CrossValidated:
         """The fit as `fits.fit` fits it, with each incidence held out, and its evidence."""
-
-        def fitted() -> Fit:
-            problem, options, independent = self._problem(structure), self.options, coarse[structure]
-            if not undecided(problem):
-                return self._fit(problem)
-            if needs_discrepancy(without_discrepancy(independent), options.fit):
-                seed, starts = self.seed, options.starts
-                return fit_with_discrepancy(problem, independent, starts=starts, seed=seed, options=options.fit)
-            return self._fit(self._problem(structure, independent=True))
-
-        fit, key = self._load_or_fit(structure, "+full", fitted), named(structure)
+        problem = Problem(self.library.stack(structure), self.data, **self.settings)
+        fit, key = self._load_or_fit(structure, "+full", problem), named(structure)
         record = None if self.store is None else self.store.get(key)
         if record is not None:
             checked = record["cross-validation"]
@@ -376,22 +361,17 @@ class _Work(NamedTuple):
             self.store.put(key, {"cross-validation": vars(result.checked), "evidence": vars(result.evidence)})
         return result
 
-    def _problem(self, structure: Structure, independent: bool = False) -> Problem:
-        problem = Problem(self.library.stack(structure), self.data, **self.settings)
-        return replace(problem, noise=replace(problem.noise, discrepancy=False)) if independent else problem
-
-    def _fit(self, problem: Problem, screen: bool = False) -> Fit:
-        options = self.options
-        return run_fit(problem, starts=options.starts, seed=self.seed, options=options.fit, screen=screen)
-
-    def _load_or_fit(self, structure: Structure, kind: str, fitted: Callable[[], Fit]) -> Fit:
+    def _load_or_fit(self, structure: Structure, kind: str, problem: Problem, screen: bool = False) -> Fit:
         """The fit of a structure, from its result directory if it is there."""
-        if self.store is None:
-            return fitted()
-        path = self.store.path.with_name("+".join(name.replace(" ", "-") for name in structure) + kind)
-        if path.is_dir():
-            return load_fit(path)
-        save_fit(fit := fitted(), path)
+        path = None
+        if self.store is not None:
+            path = self.store.path.with_name("+".join(name.replace(" ", "-") for name in structure) + kind)
+            if path.is_dir():
+                return load_fit(path)
+        options = self.options
+        fit = run_fit(problem, starts=options.starts, seed=self.seed, options=options.fit, screen=screen)
+        if path is not None:
+            save_fit(fit, path)
         return fit
 
     def in_parallel(

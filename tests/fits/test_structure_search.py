@@ -128,8 +128,8 @@ def test_every_structure_has_the_instrument_and_another_search_is_refused(data, 
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"layers": 9}, r"layers is 9; it must be a whole number in \[0, 6\]"),
-        ({"beam": 0.5}, "beam is 0.5; it must be a whole number"),
+        ({"layers": 9}, "layers: 9 is not a whole number from 0 to 6"),
+        ({"beam": 0.5}, "beam: 0.5 is not a whole number of at least 1"),
         ({"bic_gain": float("nan")}, "bic_gain is nan; it must be a finite number of at least 0"),
     ],
 )
