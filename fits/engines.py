@@ -126,7 +126,7 @@ def local_cluster(processes: int) -> Iterator[Any]:
             n_workers=processes,
             threads_per_worker=1,
             memory_limit=0,
-            dashboard_address=None,
+            dashboard_address=":0",
             silence_logs=logging.CRITICAL,
             env=environment(),
             preload=__name__,

@@ -1,10 +1,8 @@
 """How a map is fitted, and what decides a flag or a verdict: one documented number a line, all of them in the store."""
 
-import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
-from numbers import Real
 from typing import Any, Literal, get_args
 
 from fits._files import require_switch
@@ -12,7 +10,7 @@ from fits.names import Objective
 from fits.problem.instrument import Instrument
 from fits.problem.parameters import Free
 from fits.progress import Progress
-from layerjax._checks import require_choice, require_count, require_kind
+from layerjax._checks import require_choice, require_count, require_kind, require_number
 
 Kind = Literal["gaussian", "total_variation"]
 SCALES = 1e-6, 1e6
@@ -29,8 +27,8 @@ class SpatialPrior:
             d² / (2 eps scale) + eps / (2 scale) where abs(d) < eps = scale / 10; areas are even and edges stay.
         scale: of the difference between neighbours, as a share of the bounds of a parameter (of their logarithms, for
             `LogUniform` and `LogNormal`): its standard deviation, or for a total variation its mean absolute value. A
-            number for all parameters, or numbers by name, such as ``{"base.albedo": 0.02}`` (of all channels) or
-            ``{"base.albedo[2]": 0.02}``; others are not smoothed. From 1e-6 to 1e6.
+            number for all parameters, or numbers by name, such as ``{"base.albedo": 0.02}`` (of all channels); others
+            are not smoothed. From 1e-6 to 1e6.
         rounds: at most so many, in each of which every texel is fitted again.
 
     Raises:
@@ -45,12 +43,12 @@ class SpatialPrior:
         require_choice("SpatialPrior.kind", self.kind, get_args(Kind))
         require_count("SpatialPrior.rounds", self.rounds, 1)
         if not isinstance(self.scale, Mapping):
-            _require_number("SpatialPrior.scale", self.scale, *SCALES)
+            require_number("SpatialPrior.scale", self.scale, *SCALES)
         elif not self.scale:
             raise ValueError("SpatialPrior.scale is empty; it must name a parameter, or be a number")
         else:
             for name, scale in self.scale.items():
-                _require_number(f"SpatialPrior.scale[{name!r}]", scale, *SCALES)
+                require_number(f"SpatialPrior.scale[{name!r}]", scale, *SCALES)
 
     def scales(self, names: Sequence[str]) -> dict[str, float]:
         """Scales of those of these parameters that are smoothed. ValueError: a scale is of none of them."""
@@ -58,11 +56,10 @@ class SpatialPrior:
             return dict.fromkeys(names, float(self.scale))
         whole = {name: re.sub(r"\[\d+\]$", "", name) for name in names}  # without the channel
         for name in self.scale:
-            if name not in {*names, *whole.values()}:
-                raise ValueError(f"SpatialPrior.scale names {name!r}; it must be one of {', '.join(names)}")
-        # a channel's own goes before that of all channels
-        scales = {name: self.scale.get(name, self.scale.get(whole[name])) for name in names}
-        return {name: float(scale) for name, scale in scales.items() if scale is not None}
+            if name not in whole.values():
+                known = ", ".join(dict.fromkeys(whole.values()))
+                raise ValueError(f"SpatialPrior.scale names {name!r}; it must be one of {known}")
+        return {name: float(self.scale[whole[name]]) for name in names if whole[name] in self.scale}
 
 
 @dataclass(frozen=True)
@@ -129,9 +126,9 @@ class MapOptions:
                             "emulator_min_texels": 0, "emulator_max_solves": 1}.items():  # fmt: skip
             require_count(name, getattr(self, name), least)
         for name in ("emulator_error", "settled", "pilot_factor", "numerical_error", "chi_square_sigmas"):
-            _require_number(name, getattr(self, name), 0.0, math.inf)
+            require_number(name, getattr(self, name), 0.0)
         for name in ("poor_probability", "pilot_quantile", "converged_share", "flagged_share"):
-            _require_number(name, getattr(self, name), 0.0, 1.0)
+            require_number(name, getattr(self, name), 0.0, 1.0)
         require_switch("emulator", self.emulator, None)
         require_switch("force", self.force)
         require_kind("spatial_prior", self.spatial_prior, SpatialPrior, None)
@@ -150,11 +147,6 @@ class MapOptions:
         """Report progress, where somebody listens."""
         if self.progress is not None:
             self.progress(stage, done, total, note)
-
-
-def _require_number(name: str, value: Any, low: float, high: float) -> None:
-    if not (isinstance(value, Real) and low <= float(value) <= high):
-        raise ValueError(f"{name} is {value!r}; it must be a number from {low:g} to {high:g}")
 
 
 DEFAULT = MapOptions()

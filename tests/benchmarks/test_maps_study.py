@@ -55,10 +55,6 @@ def test_a_scheduler_is_full_where_chunks_are_asked_for_as_fast_as_it_hands_them
     # 1,000 chunks: one core after the other; and 256 cores as fast as the scheduler
     assert found.times == pytest.approx((10_007.0, 632.0, 57.0))
     assert paper.on_paper(row(), 1000, None, texels=1_000_000).times[-1] == pytest.approx(7.0 + 1e4 / 256)
-    # chunks of 0.1 s go five at a time
-    short = paper.on_paper(row(rate=20_000.0), 1000, 20.0, texels=1_000_000)
-    assert short.saturated == pytest.approx(10.0)
-    assert short.times == pytest.approx((107.0, 17.0, 17.0))
 
 
 def test_a_process_has_had_as_much_memory_as_it_has() -> None:
@@ -88,13 +84,12 @@ def test_a_tiny_run_writes_whole_files(tmp_path: Path) -> None:
     assert 0.8 < found["width"] < 1.25  # of 256 texels known to 5 %, of four the furthest
     assert found["peak"] > 1e8
     assert {one["what"].partition(":")[0] for one in content["workers"]} == {
-        "2 processes against 1",
         "a chunk of 64 texels beside its solution",
         "memory of a worker",
         "a million texels",
         "the pilot",
     }
-    assert [engine["tasks"] for engine in content["engines"]] == [8, 8]
+    assert [engine["tasks"] for engine in content["engines"]] == [8]
     assert "left out" in text
 
 
@@ -112,5 +107,3 @@ def test_scipy_begins_where_fits_of_the_map_do_and_ends_as_low() -> None:
         np.testing.assert_allclose(ours, theirs, atol=fitting.ROUNDING)
         truth = np.stack([one.truth[name].ravel()[[3, 60]] for name in found.names], axis=1)
         assert np.all(ours < fitting.costs_at(job, rows, truth))
-        begun = found.start.ravel()[[3, 60]]
-        np.testing.assert_allclose(units, job.pilot.starts.units[begun], atol=1e-6)

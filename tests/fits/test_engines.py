@@ -18,7 +18,7 @@ from tests.helpers import tasks
 from tests.helpers.places import ROOT
 from tests.helpers.tasks import running, started, wait_until
 
-distributed = pytest.importorskip("distributed")
+dask, distributed = pytest.importorskip("dask"), pytest.importorskip("distributed")
 pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning")
 
 SCRIPT = """
@@ -101,6 +101,20 @@ def test_a_task_that_kills_its_worker_costs_itself_alone(client, tmp_path):
     assert (tmp_path / "tried").read_text().split().count("2") == 4
 
 
+def test_a_scheduler_that_stops_is_named(tmp_path):
+    options = {"n_workers": 1, "processes": False, "dashboard_address": ":0", "silence_logs": 50}
+    with (
+        dask.config.set({"distributed.comm.timeouts.connect": "1s"}),
+        distributed.LocalCluster(**options) as cluster,
+        distributed.Client(cluster, set_as_default=False) as client,
+    ):
+        results = run(tasks.slow, str(tmp_path), range(100), client=client)
+        next(results)
+        cluster.sync(cluster.scheduler.close)
+        with pytest.raises(OSError, match="the scheduler has stopped"):
+            list(results)
+
+
 def test_leaving_the_loop_cancels_what_was_submitted(client, tmp_path):
     results = run(tasks.slow, str(tmp_path), range(1000), client=client)
     next(results)
@@ -136,8 +150,6 @@ def test_workers_end_with_their_parent(tmp_path, sent):
 
 
 def test_what_is_no_cluster_is_refused(client, monkeypatch):
-    import dask
-
     def refused(message, error=ValueError, **more):
         with pytest.raises(error, match=message):
             list(run(tasks.nothing, None, [1], **more))

@@ -1,13 +1,9 @@
-"""Killed workers and parents, schedulers that go away, full disks: nothing is lost or half written, and in the end the
-store is that of an undisturbed run, to the bit."""
+"""Killed workers and parents: nothing is lost or half written, and in the end the store is that of an undisturbed run,
+to the bit (full disks: `test_store`; schedulers that stop: `test_engines`)."""
 
-import json
 import os
 import random
-import shutil
 import signal
-import subprocess
-import threading
 import time
 from collections import Counter
 from contextlib import suppress
@@ -17,9 +13,10 @@ import pytest
 
 from fits.cli.parser import main
 from fits.maps.store import open_map
-from tests.helpers.files import mounted
 from tests.helpers.quick_maps import assert_same, command, write_files
 from tests.helpers.tasks import running, started, wait_until
+
+pytest.importorskip("distributed")
 
 CLI, PATIENCE = ["-m", "fits.cli"], 120.0
 SLOW_DISK = """import os, time
@@ -31,20 +28,17 @@ os.replace = slowly
 """
 
 
-@pytest.fixture(scope="module")
-def place(tmp_path_factory):
-    """A folder with a map of 16 chunks."""
-    folder = tmp_path_factory.mktemp("map")
-    write_files(folder, (16, 16))
+def make(folder, shape):
+    """The files of a map in chunks of 16 texels, and the store of an undisturbed run."""
+    write_files(folder, shape)
     (folder / "sitecustomize.py").write_text(SLOW_DISK)
-    return folder
+    assert main(command(folder, folder / "whole.zarr")) == 0
+    return folder, open_map(folder / "whole.zarr")
 
 
 @pytest.fixture(scope="module")
-def whole(place):
-    """The store of an undisturbed run."""
-    assert main(command(place, place / "whole.zarr", "--processes", "1")) == 0
-    return open_map(place / "whole.zarr")
+def made(tmp_path_factory):
+    return make(tmp_path_factory.mktemp("map"), (16, 16))
 
 
 def chunks_of(store):
@@ -65,65 +59,50 @@ def workers_of(process):
     return workers
 
 
-def kill_at_random(place, words, store, kills, chunks, seed):
+@pytest.mark.parametrize("kills", [2, pytest.param(50, marks=pytest.mark.slow)])
+def test_killed_at_random_moments(made, tmp_path, kills):
     """The same command repeated until it has been killed so many times, now and then as a whole and else one of its
-    workers, after a few chunks each, at any moment; what was killed how often."""
-    choice, killed, every = random.Random(seed), Counter(), min(5, kills)
+    workers, after a few chunks each, at any moment."""
+    folder, whole = made if kills == 2 else make(tmp_path, (80, 40))
+    (tmp_path / "many").mkdir()
+    out, chunks = tmp_path / "many" / "coat.zarr", whole.flags.size // 16
+    choice, killed, every = random.Random(kills), Counter(), min(5, kills)
     while killed.total() < kills:
         workers = []
-        with started([*CLI, *words], place) as process:
+        with started([*CLI, *command(folder, out, "--processes", "2")], folder) as process:
             while process.poll() is None and killed.total() < kills:
-                until = chunks_of(store) + int(1.6 * chunks / kills * choice.random())
+                until = chunks_of(out) + int(1.6 * chunks / kills * choice.random())
                 late = time.monotonic() + 10.0 * choice.random()  # as it starts, too
-                while process.poll() is None and chunks_of(store) < until and time.monotonic() < late:
+                while process.poll() is None and chunks_of(out) < until and time.monotonic() < late:
                     time.sleep(0.002)
                 time.sleep(0.05 * choice.random())
-                workers = workers_of(process.pid)
-                whole = killed.total() % every == every - 1
-                if process.poll() is None and (whole or workers):
+                workers, all_of_it = workers_of(process.pid), killed.total() % every == every - 1
+                if process.poll() is None and (all_of_it or workers):
                     with suppress(ProcessLookupError):
-                        os.kill(process.pid if whole else choice.choice(workers), signal.SIGKILL)
-                        killed["run" if whole else "worker"] += 1
+                        os.kill(process.pid if all_of_it else choice.choice(workers), signal.SIGKILL)
+                        killed["run" if all_of_it else "worker"] += 1
             process.wait(PATIENCE)
             error = process.stderr.read()
         wait_until(lambda workers=workers: not any(map(running, workers)), 10.0)  # none is left behind
         if process.returncode == 0:
             break
-        if process.returncode != -signal.SIGKILL:  # one chunk has cost three workers
+        if process.returncode != -signal.SIGKILL:  # one chunk has cost four workers
             assert process.returncode == 2
             assert "all other chunks are done, and another run does these" in error
-    return killed
-
-
-@pytest.mark.parametrize(
-    ("shape", "kills"), [((16, 16), 2), pytest.param((80, 40), 50, marks=pytest.mark.slow)], ids=["few", "fifty"]
-)
-def test_killed_at_random_moments(place, tmp_path, whole, shape, kills):
-    if shape != (16, 16):
-        write_files(tmp_path, shape)
-        shutil.copy(place / "sitecustomize.py", tmp_path)
-        place = tmp_path
-        assert main(command(place, place / "whole.zarr", "--processes", "1")) == 0
-        whole = open_map(place / "whole.zarr")
-    (tmp_path / "many").mkdir()
-    out, chunks = tmp_path / "many" / "coat.zarr", shape[0] * shape[1] // 16
-    words = command(place, out, "--processes", "2")
-    killed = kill_at_random(place, words, out, kills, chunks, seed=kills)
-    assert killed["run"] == max(kills // 5, 1)
     assert killed.total() == kills
-    assert main(command(place, out, "--processes", "1")) == 0
+    assert main(command(folder, out)) == 0
     assert chunks_of(out) == chunks
     assert_same(open_map(out), whole)
     assert os.listdir(tmp_path / "many") == ["coat.zarr"]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("processes", ["1", "2"])
-def test_one_run_at_a_time_which_the_user_interrupts(place, tmp_path, whole, processes, capsys):
+def test_one_run_at_a_time_which_the_user_interrupts(made, tmp_path, capsys):
     """Ctrl-C goes to all processes of a terminal."""
+    folder, whole = made
     out = tmp_path / "coat.zarr"
-    words = command(place, out, "--processes", processes)
-    with started([*CLI, *words], place) as process:
+    words = command(folder, out, "--processes", "2")
+    with started([*CLI, *words], folder) as process:
         wait_until(lambda: chunks_of(out) >= 2)
         process.send_signal(signal.SIGSTOP)
         assert main(["report", str(out)]) == 0  # while it runs
@@ -139,58 +118,5 @@ def test_one_run_at_a_time_which_the_user_interrupts(place, tmp_path, whole, pro
     assert error.splitlines()[-1].startswith("layerjax: interrupted: what was fitted is in")
     assert not any(map(running, workers))
     assert sorted(os.listdir(tmp_path)) == ["coat.html", "coat.zarr"]
-    assert main(command(place, out, "--processes", "1")) == 0
-    assert_same(open_map(out), whole)
-
-
-@pytest.mark.parametrize("processes", ["1", pytest.param("2", marks=pytest.mark.slow)])
-def test_a_disk_that_fills_up(place, tmp_path, whole, capsys, processes):
-    """As the store is made, as the pilot is kept, and among chunks."""
-    (tmp_path / "disk").mkdir()
-    out = tmp_path / "disk" / "coat.zarr"
-    words = command(place, out, "--processes", processes)
-    with mounted(tmp_path / "disk", "-t", "tmpfs", "-o", "size=20k", "tmpfs"):
-        done = []
-        for size in ("20k", "80k", "300k", "400k"):
-            subprocess.run(["mount", "-o", f"remount,size={size}", str(tmp_path / "disk")], check=True)
-            assert main(words) == 2
-            error = capsys.readouterr().err.splitlines()[-1]
-            assert error == f"layerjax: error: {out}: no space left on device"
-            # where one of several files does not fit, zarr tells before its threads have given up the others
-            wait_until(lambda: not list((tmp_path / "disk").rglob("*.partial")))
-            done.append(chunks_of(out))
-        assert done[0] == done[1] == 0 < done[2] < done[3] < 16
-        subprocess.run(["mount", "-o", "remount,size=20m", str(tmp_path / "disk")], check=True)
-        assert main(words) == 0
-        assert_same(open_map(out), whole)
-
-
-@pytest.mark.slow
-def test_a_worker_and_then_the_scheduler_of_a_cluster_are_killed(place, tmp_path, whole, capsys):
-    pytest.importorskip("distributed")
-    out, file = tmp_path / "coat.zarr", tmp_path / "scheduler.json"
-    where, killed = ["--no-dashboard", "--scheduler-file", str(file)], []
-    schedule = ["-m", "distributed.cli.dask_scheduler", "--port", "0", *where]
-    work = ["-m", "distributed.cli.dask_worker", "--nworkers", "2", "--nthreads", "1", *where]
-    with started(schedule, place) as scheduler, started(work, place) as nanny:
-
-        def kill():
-            wait_until(lambda: chunks_of(out) >= 1)
-            killed.append(workers_of(nanny.pid)[0])
-            os.kill(killed[0], signal.SIGKILL)
-            wait_until(lambda: chunks_of(out) >= 4)
-            scheduler.kill()
-
-        wait_until(lambda: file.exists() and file.stat().st_size > 0)
-        address = json.loads(file.read_text())["address"]
-        thread = threading.Thread(target=kill)
-        thread.start()
-        assert main(command(place, out, "--scheduler", address)) == 2
-        thread.join()
-        os.killpg(nanny.pid, signal.SIGKILL)
-    error = capsys.readouterr().err.splitlines()[-1]
-    assert error == f"layerjax: error: {address}: the scheduler has stopped"
-    assert killed
-    assert 4 <= chunks_of(out) < 16
-    assert main(command(place, out, "--processes", "1")) == 0
+    assert main(command(folder, out)) == 0
     assert_same(open_map(out), whole)
