@@ -127,14 +127,6 @@ def fit(
     return _with_discrepancy(problem, independent, before, run) if before else independent
 
 
-def fit_with_discrepancy(
-    problem: FittingProblem, independent: Fit, *, starts: int = 32, seed: int = 0, options: FitOptions = DEFAULT
-) -> Fit:
-    """The fit of a problem with model discrepancy, after one with independent noise; arguments as of `fit`."""
-    before = {name: without_discrepancy(independent.part(name)) for name in problem.problems}
-    return _with_discrepancy(problem, independent, before, _Run(starts, seed, options))
-
-
 def refit(problem: Problem, *vectors: Floats) -> Fit:
     """The fit of a problem with minima near these vectors (P,), roughly, at the resolution that the problem has."""
     ends = [rough_descent(problem, unit_of(problem, vector), fresh=False) for vector in vectors]

@@ -7,7 +7,7 @@ whatever the stack. Groups are therefore whole incidences; of fewer than three, 
 """
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -44,10 +44,6 @@ INFINITE_NOISE = 1e8
 
 LARGEST_LOG_RATIO = 30.0
 """Bound of the logarithms of ratios of stacking weights."""
-
-
-Checkpoint = Callable[[str, Callable[[], Any]], Any]
-"""Gives the record of this name: what the call computes, or what an earlier run has kept of it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +87,6 @@ def cross_validate(
     options: ComparisonOptions | None = None,
     progress: Progress | None = None,
     posterior: ImportanceDraws | None = None,
-    checkpoint: Checkpoint | None = None,
 ) -> CrossValidation:
     """Fit again without each incidence, starting from the best values, and predict its measurements.
 
@@ -104,7 +99,6 @@ def cross_validate(
         options: `min_incidences` and `scan_parts` decide what is held out together.
         progress: called with ("cross-validation", groups done, groups, name).
         posterior: draws of the fit's posterior; those without a group are sought about them.
-        checkpoint: called with (name of a group, what computes its record), gives the record: from where it is kept.
 
     Raises:
         ValueError: a fit of a named objective, data of a single group, or a joint fit or a part of one.
@@ -119,11 +113,7 @@ def cross_validate(
     for number, (name, rows) in enumerate(groups.items()):
         if progress is not None:
             progress("cross-validation", number, len(groups), name)
-
-        def held_out(rows: NDArray[np.int64] = rows) -> dict[str, Any]:
-            return _held_out(fit, data, rows, starts, draws, seed, options, proposal)
-
-        record = held_out() if checkpoint is None else checkpoint(name, held_out)
+        record = _held_out(fit, data, rows, starts, draws, seed, options, proposal)
         density[rows], errors[number] = record["log_density"], record["error"]
         converged &= record["converged"]
     if progress is not None:
@@ -257,12 +247,11 @@ def out_of_sample(
     fit: Fit,
     progress: Progress | None = None,
     options: ComparisonOptions | None = None,
-    checkpoint: Checkpoint | None = None,
 ) -> tuple[CrossValidation, Evidence]:
     """Cross-validation and evidence of a fit, both by draws of its posterior."""
     require_groups(fit, options)
     draws = posterior_draws(fit)
-    held_out = cross_validate(fit, options=options, progress=progress, posterior=draws, checkpoint=checkpoint)
+    held_out = cross_validate(fit, options=options, progress=progress, posterior=draws)
     return held_out, evidence_of(draws)
 
 
