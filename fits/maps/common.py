@@ -7,7 +7,7 @@ projection, Golub and Pereyra 1973).
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -20,7 +20,7 @@ from fits.maps.texels import Fits, Integers, Texels, fit_texels, held_by_bounds,
 from fits.optimise.multi_start import start_points
 from fits.optimise.uncertainty import LARGEST_ERROR, UNKNOWN_BEYOND
 from fits.problem.parameters import is_free
-from fits.problem.problem import Problem
+from fits.problem.problem import Problem, unit
 
 Floats = NDArray[np.float64]
 
@@ -29,15 +29,6 @@ MOST_ROUNDS, HALVINGS = 30, 8
 
 CLOSE = 0.01
 """Standard errors that a last step may be long."""
-
-
-class Common(NamedTuple):
-    """Common parameters: values and standard errors by name (NaN at a bound, infinite where the pilot says nothing),
-    and whether the joint fit converged."""
-
-    values: dict[str, float]
-    errors: dict[str, float]
-    converged: bool
 
 
 def with_common(problem: Problem, values: Mapping[str, float]) -> Problem:
@@ -55,22 +46,23 @@ def with_common(problem: Problem, values: Mapping[str, float]) -> Problem:
     return replace(problem, stack=stack, scale=scale, noise=replace(problem.noise, relative=relative, floor=floor))
 
 
-def fit_common(problem: Problem, pilot: Texels, options: MapOptions) -> Common:
-    """The common parameters where they suit the whole pilot best.
+def fit_common(problem: Problem, pilot: Texels, options: MapOptions) -> dict[str, dict[str, Any]]:
+    """The common parameters where they suit the whole pilot best: by name their `value`, `error` (NaN at a bound,
+    infinite where the pilot says nothing), `unit`, and whether the joint fit `converged`.
 
     problem: with `Free` numbers that are common, and others that are not; with the model of a map.
     """
     size, is_common = options.chunk_size, np.isin(problem.names, problem.common_names)
     places, own = np.flatnonzero(is_common), np.flatnonzero(~is_common)
 
-    def values_at(at: Floats) -> dict[str, float]:
+    def vector_at(at: Floats) -> Floats:
         unit = np.full(len(problem.names), 0.5)
         unit[places] = at
-        vector = np.asarray(problem.model.box.from_unit(jnp.asarray(unit)), float)
-        return {problem.names[place]: float(vector[place]) for place in places}
+        return np.asarray(problem.model.box.from_unit(jnp.asarray(unit)), float)
 
     def held_at(at: Floats) -> Problem:
-        held = with_common(problem, values_at(at))
+        vector = vector_at(at)
+        held = with_common(problem, {problem.names[place]: float(vector[place]) for place in places})
         return with_own_directions(held) if pilot.wi is not None else held
 
     # begin at the mean of what a few texels say of them, weighted by their information
@@ -83,62 +75,54 @@ def fit_common(problem: Problem, pilot: Texels, options: MapOptions) -> Common:
     fits = search(held, starts, pilot, size, options).fits
     pilot, units = pilot.rows(fits.finite), fits.unit[fits.finite]
 
-    def joint_at(at: Floats, units: Floats) -> _Joint:
+    def joint_at(at: Floats, units: Floats) -> tuple[float, Floats, Floats]:
         whole = np.empty((pilot.number, len(problem.names)))
         whole[:, places], whole[:, own] = at, units
-        return _joint(problem, places, own, fit_texels(problem, whole, pilot, size, fresh=False, most_steps=1))
+        found = fit_texels(problem, whole, pilot, size, fresh=False, most_steps=1)
+        cost, gradient, information = eliminated(problem, places, own, found)
+        return cost, *newton_step(at, gradient, information)
 
     # Gauss-Newton steps, the texels following each of them
-    joint, converged = joint_at(at, units), False
+    (cost, step, error), converged = joint_at(at, units), False
     for _ in range(MOST_ROUNDS):
-        step, error = joint.step(at)
-        if np.all(np.abs(step) <= np.nan_to_num(CLOSE * error)):
-            converged = True
+        if converged := bool(np.all(np.abs(step) <= np.nan_to_num(CLOSE * error))):
             break
         for halving in range(HALVINGS):
             trial = np.clip(at + 0.5**halving * step, 0.0, 1.0)
             followed = fit_texels(held_at(trial), units, pilot, size, fresh=False).unit
             tried = joint_at(trial, followed)
-            if tried.cost < joint.cost:
+            if tried[0] < cost:
                 break
         else:
             converged = bool(np.all(np.abs(step) <= np.nan_to_num(error)))  # rounding ends all progress
             break
-        at, units, joint = trial, followed, tried
-    values, error = values_at(at), joint.step(at)[1]
-    vector = np.full(len(problem.names), 1.0)
-    vector[places] = list(values.values())
+        at, units, (cost, step, error) = trial, followed, tried
+    vector = vector_at(at)
     errors = error * widths(problem, vector)[places]
-    return Common(values, dict(zip(values, errors.tolist(), strict=True)), converged)
+    return {
+        name: {"value": float(vector[place]), "error": float(one), "unit": unit(name), "converged": converged}
+        for name, place, one in zip(problem.common_names, places, errors, strict=True)
+    }
 
 
-class _Joint(NamedTuple):
-    """The joint problem of M texels, with S common parameters in the unit box and those that are a texel's own.
-
-    cost: of all texels. gradient: (S,). information: (S, S), of the common parameters, with the others free.
-    """
-
-    cost: float
-    gradient: Floats
-    information: Floats
-
-    def step(self, at: Floats) -> tuple[Floats, Floats]:
-        """A Gauss-Newton step from there and standard errors, in boxes: 0 and NaN for what a bound holds, 0 and
-        infinite for what the data do not know."""
-        free = np.flatnonzero(~held_by_bounds(at, self.gradient))
-        step, error = np.zeros(len(at)), np.full(len(at), np.nan)
-        if free.size:
-            sizes, directions = np.linalg.eigh(self.information[np.ix_(free, free)])
-            known = sizes > np.finfo(float).eps * free.size * max(sizes[-1], 0.0)
-            spread = np.where(known, 1.0 / np.sqrt(np.where(known, sizes, 1.0)), LARGEST_ERROR)
-            step[free] = -directions @ (np.where(known, spread**2, 0.0) * (directions.T @ self.gradient[free]))
-            lengths = np.linalg.norm(directions * spread, axis=1)
-            error[free] = np.where(lengths > UNKNOWN_BEYOND, np.inf, lengths)
-        return step, error
+def newton_step(at: Floats, gradient: Floats, information: Floats) -> tuple[Floats, Floats]:
+    """A Gauss-Newton step of S common parameters and their standard errors, in boxes: 0 and NaN for what a bound holds,
+    0 and infinite for what the data do not know."""
+    free = np.flatnonzero(~held_by_bounds(at, gradient))
+    step, error = np.zeros(len(at)), np.full(len(at), np.nan)
+    if free.size:
+        sizes, directions = np.linalg.eigh(information[np.ix_(free, free)])
+        known = sizes > np.finfo(float).eps * free.size * max(sizes[-1], 0.0)
+        spread = np.where(known, 1.0 / np.sqrt(np.where(known, sizes, 1.0)), LARGEST_ERROR)
+        step[free] = -directions @ (np.where(known, spread**2, 0.0) * (directions.T @ gradient[free]))
+        lengths = np.linalg.norm(directions * spread, axis=1)
+        error[free] = np.where(lengths > UNKNOWN_BEYOND, np.inf, lengths)
+    return step, error
 
 
-def _joint(problem: Problem, places: Integers, rest: Integers, fits: Fits) -> _Joint:
-    """What M texels say together, from what each says of all parameters."""
+def eliminated(problem: Problem, places: Integers, rest: Integers, fits: Fits) -> tuple[float, Floats, Floats]:
+    """What M texels say together of S common parameters, with those that are a texel's own free: cost, gradient (S,)
+    and information (S, S), in the unit box."""
     box, count, gradient = problem.model.box, len(fits.cost), np.array(fits.gradient)
     # a prior of common parameters counts once in all, and not once a texel
     slopes = np.array(box.prior_slopes(), float)
@@ -156,6 +140,4 @@ def _joint(problem: Problem, places: Integers, rest: Integers, fits: Fits) -> _J
     solved = np.linalg.pinv(inner, hermitian=True) @ np.concatenate([across, slope[:, :, None]], axis=2)
     reduced = np.einsum("mis,mit->st", across, solved[:, :, :-1])
     whole = information[:, places[:, None], places].sum(axis=0)
-    return _Joint(
-        cost, gradient[:, places].sum(axis=0) - np.einsum("mis,mi->s", across, solved[:, :, -1]), whole - reduced
-    )
+    return cost, gradient[:, places].sum(axis=0) - np.einsum("mis,mi->s", across, solved[:, :, -1]), whole - reduced

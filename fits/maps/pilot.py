@@ -29,7 +29,7 @@ from fits.optimise.resolution import has_rays, leaves_rays_open, resolution_in_w
 from fits.problem.model import Model
 from fits.problem.noise import DEFAULT_FLOOR, DEFAULT_RELATIVE, Noise
 from fits.problem.parameters import Free, is_free
-from fits.problem.problem import Problem, unit
+from fits.problem.problem import Problem
 from fits.problem.stack_file import transport_from_dict, transport_to_dict
 
 Floats = NDArray[np.float64]
@@ -201,10 +201,8 @@ def fit_pilot(
     common: dict[str, Any] = {}
     if problem.common_names:
         options.report("common", 0, len(problem.common_names))
-        values, errors, converged = fit_common(map_problem(problem, own_directions, None), texels, options)
-        problem = with_common(problem, values)
-        for name, value in values.items():
-            common[name] = {"value": value, "error": errors[name], "unit": unit(name), "converged": converged}
+        common = fit_common(map_problem(problem, own_directions, None), texels, options)
+        problem = with_common(problem, {name: one["value"] for name, one in common.items()})
 
     # the pilot, at finer resolutions until its noise hides their error
     options.report("pilot", 0, texels.number)
