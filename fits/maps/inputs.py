@@ -8,7 +8,7 @@ xarray, whose numbers are read when they are accessed.
 import math
 import os
 import re
-from collections.abc import Hashable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -32,7 +32,7 @@ Block = tuple[slice, ...]
 Arrays = dict[str, xr.DataArray]
 
 SAMPLE, CHANNEL = "sample", "channel"
-"""Names of the axes of measurements and of channels in xarray; by them they are found wherever they stand."""
+"""Names of the axes of measurements and of channels in xarray."""
 
 VECTORS, ANGLES = ("wi", "wo"), ("theta_i", "phi_i", "theta_o", "phi_o")
 FILES = (".npy", ".h5", ".hdf5", ".zarr")
@@ -60,10 +60,6 @@ def _array(source: Any, where: str) -> xr.DataArray:
     """An array of numpy, h5py, zarr or xarray, or what numpy makes one of, under the name that errors call it."""
     if isinstance(source, xr.DataArray | xr.Variable):
         variable = source if isinstance(source, xr.Variable) else source.variable
-        unnamed = [
-            (name, f"dim_{axis}") for axis, name in enumerate(variable.dims) if str(name).startswith("phony_dim")
-        ]
-        variable = variable.to_base_variable()._replace(dims=[dict(unnamed).get(name, name) for name in variable.dims])
     else:
         array = source if hasattr(source, "dtype") and hasattr(source, "shape") else np.asarray(source)
         if isinstance(array, np.ma.MaskedArray):
@@ -81,8 +77,7 @@ def _arrays(source: Any, wanted: str) -> Arrays:
         return _arrays_of_file(str(source), wanted)
     if isinstance(source, Mapping):
         return _numbers(source.variables if isinstance(source, xr.Dataset) else source, wanted)
-    beside = _numbers(source.coords, wanted) if isinstance(source, xr.DataArray) else {}
-    return beside | {wanted: _array(source, wanted)}
+    return {wanted: _array(source, wanted)}
 
 
 def _numbers(members: Mapping[Any, Any], where: str) -> Arrays:
@@ -178,11 +173,6 @@ def _with_axes(array: xr.DataArray, sizes: Mapping[str, int], *choices: tuple[st
         allowed = " or ".join(map(str, shapes))
         raise ValueError(f"{array.name} has shape {array.shape}, must be {allowed} for these values and directions")
     return array.rename(dict(zip(array.dims, shapes[array.shape], strict=True)))
-
-
-def _ordered(array: xr.DataArray, dims: tuple[Hashable, ...]) -> xr.DataArray:
-    """The same with its named axes in this order, as far as it has them, and others last."""
-    return array.transpose(*(name for name in dims if name in array.dims), ...)
 
 
 # ---- the measurements of a map ----
@@ -286,8 +276,8 @@ def map_data(values: Any, geometry: Any = None, sigma: Any = None, mask: Any = N
     """Open the measurements of a map.
 
     Each array may be one of numpy (mapped or not), h5py, zarr or xarray, or a path: of a .npy file, of an HDF5 file or
-    zarr store that holds one array, or one of the argument's name, or ``file.h5:/name``, ``store.zarr:/name``. Axes of
-    xarray that are called "sample" and "channel" are found wherever they stand; others are taken in their order.
+    zarr store that holds one array, or one of the argument's name, or ``file.h5:/name``, ``store.zarr:/name``. Axes
+    count by their order, but those of values that xarray calls "sample" and "channel", which may stand anywhere.
 
     Args:
         values: (..., N, C), or (..., N) for one channel, BSDF in 1/sr. Where both fit it is (..., N, C). A value that
@@ -306,14 +296,14 @@ def map_data(values: Any, geometry: Any = None, sigma: Any = None, mask: Any = N
     if 0 in array.shape:
         raise ValueError(f"{array.name} has shape {array.shape}, must hold something along every axis")
     array = array.transpose(..., *(name for name in (SAMPLE, CHANNEL) if name in array.dims))
-    directions = _directions(geometry, arrays, tuple(name for name in array.dims if name != CHANNEL))
+    directions = _directions(geometry, arrays)
     components = ("xyz",) if "wi" in directions else ()
     samples = next(iter(directions.values())).shape[-1 - len(components)]
 
     # the last axes are those of measurements and channels, or of measurements
-    if array.ndim > 2 and array.shape[-2] == samples and (CHANNEL in array.dims or SAMPLE not in array.dims):
+    if array.ndim > 2 and array.shape[-2] == samples and array.dims[-1] != SAMPLE:
         shape, channels = array.shape[:-2], array.shape[-1]
-    elif array.ndim > 1 and array.shape[-1] == samples and CHANNEL not in array.dims:
+    elif array.ndim > 1 and array.shape[-1] == samples:
         shape, channels = array.shape[:-1], 1
     else:
         raise ValueError(
@@ -328,7 +318,7 @@ def map_data(values: Any, geometry: Any = None, sigma: Any = None, mask: Any = N
     def other(source: Any, wanted: str, *choices: tuple[str, ...]) -> xr.DataArray | None:
         if source is None:
             return None
-        return _with_axes(_ordered(_choose(source, wanted, _arrays(source, wanted)), array.dims), sizes, *choices)
+        return _with_axes(_choose(source, wanted, _arrays(source, wanted)), sizes, *choices)
 
     deviations = other(sigma, "sigma", (*texels, SAMPLE, CHANNEL), (*texels, SAMPLE), (SAMPLE,))
     part = other(mask, "mask", texels)
@@ -345,8 +335,8 @@ def map_data(values: Any, geometry: Any = None, sigma: Any = None, mask: Any = N
     return data
 
 
-def _directions(geometry: Any, arrays: Arrays, dims: tuple[Hashable, ...]) -> Arrays:
-    """The arrays of directions by name; arrays: those beside the values, whose axes have these names."""
+def _directions(geometry: Any, arrays: Arrays) -> Arrays:
+    """The arrays of directions by name; arrays: those beside the values."""
     where = "geometry is not given, and there is nothing beside the values that"
     if geometry is not None:
         if isinstance(geometry, str | Path) and Path(geometry).is_file() and Path(geometry).suffix.lower() not in FILES:
@@ -366,7 +356,7 @@ def _directions(geometry: Any, arrays: Arrays, dims: tuple[Hashable, ...]) -> Ar
         least = 2 if names is VECTORS else 1
         if arrays[name].ndim < least or 0 in arrays[name].shape:
             raise ValueError(f"{arrays[name].name} ({name}) has shape {arrays[name].shape}, must be (N, 3) or (N,)")
-    return {name: _ordered(arrays[name], dims) for name in names}
+    return {name: arrays[name] for name in names}
 
 
 def _unit_vectors(directions: Mapping[str, Floats], used: NDArray[np.bool_], where: str) -> tuple[Floats, Floats]:

@@ -82,12 +82,6 @@ def test_a_named_axis_decides():
     other = map_data(xarray.DataArray(square, dims=("channel", "sample", "b")), VIEW)
     assert (other.shape, other.channels) == ((N,), N)
     np.testing.assert_array_equal(other.read().values, square.transpose(2, 1, 0))
-    # and those of mask and sigma follow those of the values
-    mask, sigma = xarray.DataArray(MASK, dims=DIMS[:2]).transpose(), xarray.DataArray(SIGMA, dims=DIMS)
-    turned = sigma.transpose("channel", "x", "sample", "y")
-    data = map_data(xarray.DataArray(VALUES, dims=DIMS), VIEW, sigma=turned, mask=mask).read()
-    np.testing.assert_array_equal(data.mask, MASK)
-    np.testing.assert_array_equal(data.sigma, SIGMA)
 
 
 @pytest.mark.parametrize("sigma", [SIGMA, SIGMA[..., 0], SIGMA[0, 0, :, 0]], ids=["full", "same for channels", "N"])
@@ -237,8 +231,7 @@ def test_directions_may_stand_beside_the_values(tmp_path, kind, each):
         data = map_data(f"{hdf5_file(tmp_path / 'v.h5', arrays)}:/scan/values")
     else:
         named = {name: (DIMS[3 - np.ndim(array) : 3], array) for name, array in angles.items()}
-        data = map_data(xarray.DataArray(VALUES, dims=DIMS, coords=named).transpose("x", ...))
-        wo = np.swapaxes(wo, 0, 1) if each else wo
+        data = map_data(xarray.Dataset({"values": (DIMS, VALUES)}, coords=named))
     assert (data.geometry is None) == each
     if not each:
         np.testing.assert_allclose((data.geometry.wi, data.geometry.wo), (wi, wo), atol=1e-12)
