@@ -84,8 +84,7 @@ def fit_map(
     if noise is not None and not noise.use_sigma:
         data = replace(data, sigma=None)
     size = min(options.chunk_size, max(MapOptions.chunk_size, math.prod(data.shape)))  # no program for a million texels
-    out = given_path("out", out)
-    path = out.resolve() if out.is_symlink() else out  # one lock for all links to a store
+    path = given_path("out", out)
     if not path.resolve().parent.is_dir():
         raise ValueError(f"{path}: there is no directory {path.parent}")
     with locked(Path(f"{path}.lock"), str(path)), connected(client, options.processes) as connection:
