@@ -104,23 +104,16 @@ class Store:
             yield store
 
     @classmethod
-    def read(cls, path: str | Path, fingerprint: Mapping[str, str] | None = None) -> Self:
+    def read(cls, path: str | Path) -> Self:
         """The records as they are now, though another process may be writing: a copy in memory.
 
-        fingerprint: of the problem, if the work of another one is to be refused.
-
-        Raises:
-            FileNotFoundError: there is no such file.
-            ValueError: it is damaged, is no store, or holds the work of another problem.
+        FileNotFoundError: there is no such file. ValueError: it is damaged, or no store.
         """
         path = Path(path)
         require_there(path)
         with _errors_of(path):
             _require_store(path)
-            store = cls(path, _copied(path))
-        if fingerprint is not None and store.fingerprint and (words := differences(store.fingerprint, fingerprint)):
-            raise ValueError(another(path, words))
-        return store
+            return cls(path, _copied(path))
 
     def keys(self) -> list[str]:
         """Keys of all records, in the order in which they were written."""

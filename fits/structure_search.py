@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 from numbers import Real
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -52,7 +52,8 @@ TOGETHER = 8
 Structure = tuple[str, ...]
 """Names of layers from top to bottom, and of the base."""
 
-Result = TypeVar("Result")
+Checked = tuple[Fit, CrossValidation, Evidence]
+"""A fit at full resolution, its cross-validation and its evidence."""
 
 # ---- what stacks are made of ----
 
@@ -70,17 +71,16 @@ class Library:
     bases: Mapping[str, lj.Stack]
 
     def __post_init__(self) -> None:
-        files: dict[str, str] = {}
         for kind, parts in (("base", self.bases), ("layer", self.layers)):
             if not parts:
                 raise ValueError(f"library: it has no {kind}; it must have at least one")
-            for name in parts:
-                if not re.fullmatch(r"\w[\w -]*", name):
-                    raise ValueError(f"library: {name!r} is no name; it must be letters, digits, blanks, - and _")
-                key = name.replace(" ", "-").casefold()
-                if key in files:
-                    raise ValueError(f"library: {files[key]!r} and {name!r} are one name as files; they must differ")
-                files[key] = name
+        files: dict[str, str] = {}
+        for name in (*self.bases, *self.layers):
+            if not re.fullmatch(r"\w[\w -]*", name):
+                raise ValueError(f"library: {name!r} is no name; it must be letters, digits, blanks, - and _")
+            if (key := name.replace(" ", "-").casefold()) in files:
+                raise ValueError(f"library: {files[key]!r} and {name!r} are one name as files; they must differ")
+            files[key] = name
 
     def stack(self, structure: Structure) -> lj.Stack:
         """The stack with these layers over this base."""
@@ -294,7 +294,7 @@ def search(
     with store as opened:
         work = _Work(data, library, settings, options, seed, opened, given_progress(progress))
         coarse: dict[Structure, Fit] = {}
-        full: dict[Structure, _CrossValidated] = {}
+        full: dict[Structure, Checked] = {}
         level: list[Structure] = [(base,) for base in library.bases]
         while level:
             leader, lowest = _ranked(full)[:1], min(map(_bic, coarse.values()), default=math.inf)
@@ -316,18 +316,10 @@ def search(
     order = [*_ranked(full), *sorted((one for one in coarse if one not in full), key=bic.__getitem__)]
     candidates = []
     for structure in order:
-        fit = full[structure].fit if structure in full else coarse[structure]
+        fit = full[structure][0] if structure in full else coarse[structure]
         above = bic[structure] - min(bic.values())
         candidates.append(Candidate(structure, len(fit.vector), above, fit, scores.get(named(structure))))
     return Search(tuple(candidates), options)
-
-
-class _CrossValidated(NamedTuple):
-    """A fit at full resolution, its cross-validation and its evidence."""
-
-    fit: Fit
-    checked: CrossValidation
-    evidence: Evidence
 
 
 class _Work(NamedTuple):
@@ -347,7 +339,7 @@ class _Work(NamedTuple):
         problem = replace(problem, noise=replace(problem.noise, discrepancy=False))
         return self._load_or_fit(structure, "", problem, screen=True)
 
-    def cross_validate(self, structure: Structure) -> _CrossValidated:
+    def cross_validate(self, structure: Structure) -> Checked:
         """The fit as `fits.fit` fits it, with each incidence held out, and its evidence."""
         problem = Problem(self.library.stack(structure), self.data, **self.settings)
         fit, key = self._load_or_fit(structure, "+full", problem), named(structure)
@@ -355,11 +347,11 @@ class _Work(NamedTuple):
         if record is not None:
             checked = record["cross-validation"]
             checked |= {"groups": tuple(checked["groups"]), "rows": tuple(checked["rows"])}
-            return _CrossValidated(fit, CrossValidation(**checked), Evidence(**record["evidence"]))
-        result = _CrossValidated(fit, *out_of_sample(fit))
+            return fit, CrossValidation(**checked), Evidence(**record["evidence"])
+        checked, evidence = out_of_sample(fit)
         if self.store is not None:
-            self.store.put(key, {"cross-validation": vars(result.checked), "evidence": vars(result.evidence)})
-        return result
+            self.store.put(key, {"cross-validation": vars(checked), "evidence": vars(evidence)})
+        return fit, checked, evidence
 
     def _load_or_fit(self, structure: Structure, kind: str, problem: Problem, screen: bool = False) -> Fit:
         """The fit of a structure, from its result directory if it is there."""
@@ -375,11 +367,11 @@ class _Work(NamedTuple):
         return fit
 
     def in_parallel(
-        self, stage: str, call: Callable[[Structure], Result], structures: list[Structure]
-    ) -> dict[Structure, Result]:
+        self, stage: str, call: Callable[[Structure], Any], structures: list[Structure]
+    ) -> dict[Structure, Any]:
         """What the call gives by structure. Several run at a time, since compiling one keeps a single core busy; none
         runs while programs are thrown away."""
-        several, results = min(cores(), TOGETHER), dict[Structure, Result]()
+        several, results = min(cores(), TOGETHER), dict[Structure, Any]()
         self.progress(stage, 0, len(structures), named(structures[0]))
         with ThreadPoolExecutor(several) as pool:
             for first in range(0, len(structures), several):
@@ -407,16 +399,15 @@ def _bic(fit: Fit) -> float:
     return len(fit.vector) * float(np.log(fit.problem.count)) - 2.0 * fit.log_likelihood
 
 
-def _ranked(full: Mapping[Structure, _CrossValidated]) -> list[Structure]:
+def _ranked(full: Mapping[Structure, Checked]) -> list[Structure]:
     """What was cross-validated, best first."""
-    return sorted(full, key=lambda one: -full[one].checked.elpd)
+    return sorted(full, key=lambda one: -full[one][1].elpd)
 
 
-def _scores(full: Mapping[Structure, _CrossValidated]) -> dict[str, ModelScore]:
+def _scores(full: Mapping[Structure, Checked]) -> dict[str, ModelScore]:
     """Scores side by side by name, best first."""
-    ranked = {named(one): full[one] for one in _ranked(full)}
-    checked = {name: one.checked for name, one in ranked.items()}
-    return rank_models(checked, {name: one.evidence for name, one in ranked.items()})
+    ranked = _ranked(full)
+    return rank_models({named(one): full[one][1] for one in ranked}, {named(one): full[one][2] for one in ranked})
 
 
 # ---- what it found ----

@@ -14,6 +14,7 @@ it along the axes of the map, and join fitted texels alone. After each round the
 
 import json
 import math
+from contextlib import suppress
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -86,9 +87,6 @@ def work(job: Job, task: Half) -> tuple[Floats, Floats]:
 def smooth_map(store: Store, job: Job, data: MapData, client: Any, options: MapOptions) -> None:
     """Smooth a map that is fitted whole, into a group of its store, from where an earlier call stopped.
 
-    Without a client threads of this process do it, whoever fitted the map: a half round is short, and each would wait
-    for processes to start.
-
     Raises:
         ValueError: measurements that cannot be read again: they are named, and what was done of whole rounds is kept.
         OSError: of the store.
@@ -102,7 +100,9 @@ def smooth_map(store: Store, job: Job, data: MapData, client: Any, options: MapO
 
     # where an earlier call stopped, or the plain fit
     fitted = (store.flags & FLAGS["fitted"]) != 0
-    kept, moves = store.load_group(SMOOTHED), list[float]()
+    kept, moves = None, list[float]()
+    with suppress(ValueError):  # damaged: smoothed anew
+        kept = store.load_group(SMOOTHED)
     if kept is not None and kept[1]["smoothing"]["prior"] == json.loads(json.dumps(plain(said))):
         if kept[1]["finished"]:
             return

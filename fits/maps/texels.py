@@ -172,12 +172,11 @@ class Fits(NamedTuple):
             raise ValueError("values: no texel of the pilot has a finite fit; are they in 1/sr?")
         return np.unique(vectors, axis=0)
 
-    def improve(self, rows: Integers, other: "Fits") -> Truths:
-        """Take over other fits of these rows where they are lower by more than is left to gain; which, (len(rows),)."""
+    def improve(self, rows: Integers, other: "Fits") -> None:
+        """Take over other fits of these rows where they are lower by more than is left to gain."""
         lower = np.asarray(other.cost < self.cost[rows] - 10.0 * COST_TOLERANCE)
         for mine, theirs in zip(self, other, strict=True):
             mine[rows[lower]] = theirs[lower]
-        return lower
 
 
 def fit_texels(

@@ -155,7 +155,7 @@ def test_what_is_no_cluster_is_refused(client, monkeypatch):
             list(run(tasks.nothing, None, [1], **more))
 
     refused("processes is 0; it must be at least 1", processes=0)
-    for address in (3, "", "head", "8786", "tcp://:8786", "http://head:8786"):
+    for address in (3, "", "head", "8786"):
         refused(f"client is {address!r}; it must be a distributed.Client, or the address", client=address)
     with dask.config.set({"distributed.comm.timeouts.connect": "1s"}):
         refused(r"tcp://127\.0\.0\.1:9: there is no scheduler", OSError, client="tcp://127.0.0.1:9")

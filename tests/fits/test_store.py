@@ -117,7 +117,7 @@ def test_readers_change_nothing_and_a_second_writer_is_refused(tmp_path):
         with writer(path, hold) as process:
             before = contents(tmp_path)
             assert (f"{path}-journal" in before) == (hold == "within")
-            assert steps_of(Store.read(path, WHOSE)) == 6
+            assert steps_of(Store.read(path)) == 6
             with pytest.raises(ValueError, match=rf"store is in use by another process \({process.pid}\)"):
                 Store.open(path, WHOSE).__enter__()
             assert contents(tmp_path) == before
@@ -169,7 +169,7 @@ def test_damage_is_reported_and_never_read(tmp_path):
         for bad in (bytes(len(run)), bytes(255 - byte for byte in run), run[:1] + bytes([run[1] ^ 1]) + run[2:]):
             path.write_bytes(whole[:place] + bad + whole[place + 64 :])
             try:
-                found = Store.read(path, WHOSE)
+                found = Store.read(path)
             except ValueError as error:
                 assert str(error).startswith(f"{path}: damaged")  # noqa: PT017
                 reported += 1
@@ -208,13 +208,12 @@ def test_the_work_of_another_problem_is_refused_by_name(tmp_path):
     fill(path)
     before = contents(tmp_path)
     other = fingerprint(data=np.arange(4.0), seed=1)
-    for call in (lambda: Store.read(path, other), lambda: Store.open(path, other).__enter__()):
-        with pytest.raises(ValueError, match=r"holds the work of another problem \(data, seed 0, not 1\)"):
-            call()
+    with pytest.raises(ValueError, match=r"holds the work of another problem \(data, seed 0, not 1\)"):
+        Store.open(path, other).__enter__()
     assert contents(tmp_path) == before
     with Store.open(path, other, replace=True) as store:
         assert store.keys() == []
-    assert Store.read(path, other).fingerprint == other
+    assert Store.read(path).fingerprint == other
 
 
 @pytest.mark.parametrize(
