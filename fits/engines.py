@@ -29,9 +29,6 @@ IN_FLIGHT = 4
 TIMEOUT = 60.0
 """Seconds to wait for the first worker."""
 
-RETRIES = 3
-"""Retries of a task that fails neither by its own error nor by the death of its worker."""
-
 FULL = (errno.ENOSPC, errno.EDQUOT)
 """Errors of a full disk, which affect every task."""
 
@@ -246,9 +243,7 @@ def _run_cluster(work: Work, shared: Any, tasks: list[Any], client: Any) -> Iter
         def submit() -> None:
             room = IN_FLIGHT * max(1, sum(client.nthreads().values())) - len(running)
             for index, task in islice(pending, max(room, 0)):
-                future = client.submit(
-                    perform, sent, name, task, precision(), key=f"{name}-{index}", retries=RETRIES, pure=False
-                )
+                future = client.submit(perform, sent, name, task, precision(), key=f"{name}-{index}", pure=False)
                 running[future] = index
                 completed.add(future)
 
