@@ -21,7 +21,7 @@ from fits.engines import Failure, connected, end_repeated_script, run
 from fits.maps.inputs import Block, MapData, Measured, block_words, map_data
 from fits.maps.options import DEFAULT, VERDICTS, MapOptions
 from fits.maps.pilot import Job, fit_pilot, job_of, make_prototype, pilot_texels
-from fits.maps.search import neighbours_of, reduced_chi_square, search
+from fits.maps.search import reduced_chi_square, search
 from fits.maps.spatial import smooth_map
 from fits.maps.store import FLAGS, FittedMap, Store, arrays_of, blocks_of, create, open_map, resume
 from fits.maps.texels import standard_errors
@@ -207,10 +207,7 @@ def fit_chunk(job: Job, measured: Measured) -> dict[str, NDArray[Any]]:
     fitted = np.flatnonzero(mask & enough)
     if len(fitted):
         rows = texels.rows(fitted)
-        places = np.full(texels.number + 1, -1)  # among the texels that are fitted; the last is none
-        places[fitted] = np.arange(len(fitted))
-        neighbours = places[neighbours_of(shape)[fitted]]
-        best, poor, restarted = search(problem, job.starts, rows, size, job.options, neighbours)
+        best, poor, restarted = search(problem, job.starts, rows, size, job.options)
         finite, (errors, at_bound, unidentified) = best.finite, standard_errors(problem, best, rows)
         numbers = {"reduced_chi_square": reduced_chi_square(best, rows)}
         for place, name in enumerate(names):

@@ -82,7 +82,7 @@ class MapOptions:
     chunk_size: int = 1024
     """Texels that are fitted and written together."""
     restarts: int = 3
-    """Further starts, and rounds of neighbours' values, from which a texel that ended poorly is fitted again."""
+    """Further starts from which a texel that ended poorly is fitted again."""
     emulator: bool | None = None
     """Whether an exact transport is replaced by an emulator over the bounds, made once; None: where it holds, and the
     map has `emulator_min_texels`."""

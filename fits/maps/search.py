@@ -1,7 +1,7 @@
 """The best fit of each of many texels: from the likeliest of known starts, and from others where that fit is poor.
 
-A texel is fitted again, from other starts and from its neighbours' values, only where its chi-square says that it ended
-poorly: a second minimum that fits as well is not looked for.
+A texel is fitted again, from other starts, only where its chi-square says that it ended poorly: a second minimum that
+fits as well is not looked for.
 """
 
 from dataclasses import dataclass
@@ -65,41 +65,21 @@ def fit_first(problem: Problem, points: Floats, pilot: Texels, size: int) -> Fit
     return best
 
 
-def search(
-    problem: Problem, starts: Starts, texels: Texels, size: int, options: MapOptions, neighbours: Integers | None = None
-) -> Results:
-    """Fit each texel.
-
-    Args:
-        size: of the program: texels at a time.
-        neighbours: of each texel, (M, ...), by their places; -1 where there is none.
-    """
+def search(problem: Problem, starts: Starts, texels: Texels, size: int, options: MapOptions) -> Results:
+    """Fit each texel; size: of the program, texels at a time."""
     order = likeliest(problem, starts, texels, size, options.restarts + 1)
     which = None if starts.known is None else order[:, 0]
     best = fit_texels(problem, starts.units[order[:, 0]], texels, size, known=starts.known, which=which, fresh=False)
-    restarted = np.zeros(texels.number, bool)
-    limit = explained_chi_square(problem, starts, texels, options)
+    limit, restarted = explained_chi_square(problem, starts, texels, options), np.zeros(texels.number, bool)
 
     def poor() -> Truths:
         """Which fits are worse than noise and pilot explain, or have not converged."""
         return ~((reduced_chi_square(best, texels) <= limit) & best.converged)
 
-    def refit(rows: Integers, units: Floats) -> None:
-        if len(rows):
-            restarted[rows] = True
-            best.improve(rows, fit_texels(problem, units, texels.rows(rows), size))
-
     for place in range(1, order.shape[1]):
-        rows = np.flatnonzero(poor())
-        refit(rows, starts.units[order[rows, place]])
-    for _ in range(options.restarts):
-        if neighbours is None:
-            break
-        # poor texels that have a neighbour which is not, from where the best of those ended; the place -1 is none
-        good, cost = np.append(~poor(), False), np.append(best.cost, np.inf)
-        rows = np.flatnonzero(poor() & np.any(good[neighbours], axis=1))
-        choice = np.argmin(np.where(good[neighbours[rows]], cost[neighbours[rows]], np.inf), axis=1)
-        refit(rows, best.unit[neighbours[rows, choice]])
+        if len(rows := np.flatnonzero(poor())):
+            restarted[rows] = True
+            best.improve(rows, fit_texels(problem, starts.units[order[rows, place]], texels.rows(rows), size))
     return Results(best, poor() & best.converged, restarted)
 
 
@@ -146,11 +126,3 @@ def sigmas(problem: Problem, vectors: Floats, predicted: Floats) -> Floats:
 
 def _sigmas(model: Model, vectors: Array, predicted: Array) -> Array:
     return jax.vmap(model.sigma_at)(vectors, predicted)
-
-
-def neighbours_of(shape: tuple[int, ...]) -> Integers:
-    """The places of those beside each texel of a block of this shape, (M, 2 rank); -1 beyond its edge."""
-    places = np.pad(np.arange(int(np.prod(shape))).reshape(shape), 1, constant_values=-1)
-    inner = tuple(slice(1, -1) for _ in shape)
-    moved = [np.roll(places, step, axis)[inner] for axis in range(len(shape)) for step in (1, -1)]
-    return np.stack([one.reshape(-1) for one in moved], axis=1)
