@@ -80,13 +80,10 @@ def test_records_come_back(tmp_path):
             assert one.get("other") is None
             assert one.fingerprint == WHOSE
             found = one.get("record")
-            for key in ("coords", "none", "device"):
-                np.testing.assert_array_equal(found[key], record[key])
-                assert found[key].dtype == record[key].dtype
-            np.testing.assert_array_equal(found["state"][1], record["state"][1])
-            assert [found["state"][k] for k in (0, 2, 3)] == ["MT19937", 3, 0.1]
-            assert np.isnan(found["worst"])
-            assert (found["cost"], found["count"], found["nothing"], found["words"]) == (np.inf, 3, None, {"ä": True})
+            np.testing.assert_equal(found, record)
+            assert {key: found[key].dtype for key in ("coords", "none", "device")} == {
+                key: record[key].dtype for key in ("coords", "none", "device")
+            }
         with pytest.raises(TypeError, match="object cannot be kept in a store"):
             again.put("record", {"it": object()})
     assert [one.name for one in tmp_path.iterdir()] == ["store"]
@@ -235,10 +232,5 @@ def test_the_work_of_another_problem_is_refused_by_name(tmp_path):
 def test_a_fingerprint_tells_problems_apart(one, other):
     assert "part" in differences(fingerprint(part=one), fingerprint(part=other))
     assert fingerprint(part=one) == fingerprint(part=one)
-
-
-def test_a_fingerprint_holds_in_other_processes():
-    made = [lambda: object(), lambda: [lambda: None]]
-    for make in made:
-        one, other = make(), make()  # both at once, so that they differ in place
-        assert fingerprint(part=one) == fingerprint(part=other)
+    here, there = object(), object()  # both at once, so that they differ in place, as they do in other processes
+    assert fingerprint(part=here) == fingerprint(part=there)
