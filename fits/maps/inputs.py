@@ -10,7 +10,6 @@ import os
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -38,8 +37,8 @@ VECTORS, ANGLES = ("wi", "wo"), ("theta_i", "phi_i", "theta_o", "phi_o")
 FILES = (".npy", ".h5", ".hdf5", ".zarr")
 NORMAL = (0.0, 0.0, 1.0)
 
-WHOLE, BLOCKS = 2**23, 64
-"""Numbers of a map that is fingerprinted as a whole; and blocks that are of any."""
+WHOLE, SOME = 2**23, 64
+"""Numbers of a map that is fingerprinted as a whole; and texels that are of a larger one."""
 
 
 # ---- arrays, wherever they are ----
@@ -256,20 +255,15 @@ class MapData:
         return np.array(variable.set_dims({**sizes, SAMPLE: self.samples, CHANNEL: self.channels}).values)
 
     def fingerprint(self) -> str:
-        """What distinguishes these measurements from others: of shape and directions, and of blocks from all over the
-        map, the whole of it up to 64 MiB. ValueError: a block cannot be read."""
-        common = () if self.geometry is None else (self.geometry.wi, self.geometry.wo)
-        parts = [fingerprint(part=list(self.read(block))) for block in self._blocks()]
+        """What distinguishes these measurements from others: of shape and directions, and of all numbers up to 64 MiB,
+        or else of texels from all over the map. ValueError: a block cannot be read."""
+        common, texels = () if self.geometry is None else (self.geometry.wi, self.geometry.wo), math.prod(self.shape)
+        blocks: list[Block] = [()]
+        if texels * self.samples * self.channels > WHOLE:
+            places = np.unravel_index(np.linspace(0, texels - 1, SOME).astype(int), self.shape)
+            blocks = [tuple(slice(at, at + 1) for at in place) for place in np.transpose(places).tolist()]
+        parts = [fingerprint(part=list(self.read(block))) for block in blocks]
         return fingerprint(measurements=[[self.shape, self.samples, self.channels, *common], parts])["measurements"]
-
-    def _blocks(self) -> list[Block]:
-        """At most 64 of them: slabs that hold all of a map, or of a larger one single texels."""
-        texels = math.prod(self.shape)
-        if texels * self.samples * self.channels <= WHOLE:
-            ends = np.linspace(0, self.shape[0], min(BLOCKS, self.shape[0]) + 1).astype(int).tolist()
-            return [(slice(low, high),) for low, high in pairwise(ends)]
-        places = np.unravel_index(np.linspace(0, texels - 1, BLOCKS).astype(int), self.shape)
-        return [tuple(slice(at, at + 1) for at in place) for place in np.transpose(places).tolist()]
 
 
 def map_data(values: Any, geometry: Any = None, sigma: Any = None, mask: Any = None) -> MapData:
