@@ -318,7 +318,13 @@ def _planned(job: Job, files: list[Path], done: Store | None) -> tuple[dict[str,
     rows: dict[str, Row] = {}
     tasks: list[Task] = []
     for path in files:
-        every = [Task(path, text_checksum(path), name) for name in job.stacks]
+        try:
+            content = text_checksum(path)
+        except OSError as error:
+            failed = [Task(path, "", name).failed(one_line(error)) for name in job.stacks]
+            rows |= {f"{row['file']}/{row['stack']}": row for row in failed}
+            continue
+        every = [Task(path, content, name) for name in job.stacks]
         kept = {task.key: job.kept_row(task, done) for task in every}
         left, why = [task for task in every if kept[task.key] is None], "not done yet"
         try:
