@@ -4,6 +4,7 @@ Each group of paths (reflected at the same layer, any number of turns above) is 
 follow from adding. Over a diffuse base the light that has reached it leaves as a product of two transmittances.
 """
 
+import dataclasses
 from collections.abc import Sequence
 from typing import Any, Literal, get_args
 
@@ -53,6 +54,9 @@ from layerjax.transport.statistical.streamed_base import is_streamed, make_strea
 
 INDEX_SLACK = 1e-6
 """Of the logarithm of a ratio of indices: those that are given in single precision are rounded."""
+
+LANES = 8
+"""Numbers that processors work on at once. Of fewer pairs, channels would be what they do so: they are 1 or 3."""
 
 Diffuse = Literal["tables", "exact", "lobe"]
 Energies = tuple[Channels, Channels]
@@ -151,16 +155,22 @@ class Statistical(DeterministicTransport):
         return Lit(stack, diffuse, index_below(stack), reference_index(stack), smooth_parts(stack))
 
     def evaluate(self, state: Lit, wi: Vector, wo: Vector, side: Side) -> Channels:
-        parts: list[Channels] = [(jnp.zeros_like(wi[2] * wo[2]),)]
-        if side != "transmission":
-            parts += self._reflections(state, wi, wo, upward=False)
-            if state.diffuse is not None:
-                parts.append(diffuse_part(state.diffuse, wi, wo))
+        def lobes(stack: Stack) -> Channels:
+            one = dataclasses.replace(state, stack=stack)
+            parts: list[Channels] = [(jnp.zeros_like(wi[2] * wo[2]),)]
+            if side != "transmission":
+                parts += self._reflections(one, wi, wo, upward=False)
             if side == "all" and state.passes:
-                parts += self._reflections(state, flip(wi), flip(wo), upward=True)
-        if side != "reflection" and state.passes:
-            parts += self._transmissions(state, wi, wo)
-        return channels.total(parts)
+                parts += self._reflections(one, flip(wi), flip(wo), upward=True)
+            if side != "reflection" and state.passes:
+                parts += self._transmissions(one, wi, wo)
+            return channels.total(parts)
+
+        few = jnp.size(wi[2] * wo[2]) < LANES
+        found = lobes(state.stack) if few else channels.by_channel(lambda stack: lobes(stack)[0], state.stack)
+        if state.diffuse is None or side == "transmission":
+            return found
+        return channels.total([found, diffuse_part(state.diffuse, wi, wo)])
 
     def sample(self, state: Lit, wi: Vector, uniforms: tuple[Array, Array, Array]) -> Vector:
         down = draw(self._lobes(state, wi, False), state.diffuse, wi, uniforms, *_ratios(state))
