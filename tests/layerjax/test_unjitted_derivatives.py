@@ -192,7 +192,26 @@ def test_many_numbers_and_large_batches_are_differentiated_on_the_way_back():
     assert seen == [True, False, False, False, False, False]
 
 
-def test_what_is_no_adding_doubling_is_traced(ruled):
+@pytest.mark.parametrize("name", ["haze", pytest.param("coat", marks=pytest.mark.slow)])
+def test_statistical_has_the_rule_too(name, ruled):
+    function = total(name, lj.Statistical())
+    same(jax.value_and_grad(function)(AT), jax.jit(jax.value_and_grad(function))(AT))
+    assert len(ruled) == 1
+
+
+def test_of_mirrors_statistical_is_traced(ruled):
+    """Known to be as narrow as can be, they have a closed form."""
+
+    def function(ior):
+        return jnp.sum(
+            lj.evaluate(lj.Stack([lj.Interface(ior, 1e-4)], lj.Conductor(0.2, 3.0, 0.3)), WI, WO, lj.Statistical())
+        )
+
+    same(jax.grad(function)(1.5), jax.jit(jax.grad(function))(1.5))
+    assert not ruled
+
+
+def test_of_other_transports_all_is_traced(ruled):
     function = total("haze", lj.SingleScattering())
     same(jax.grad(function)(AT), jax.jit(jax.grad(function))(AT))
     assert not ruled

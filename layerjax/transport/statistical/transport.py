@@ -29,6 +29,7 @@ from layerjax.stack import Interface, Medium, Stack
 from layerjax.surfaces import Conductor, Surface
 from layerjax.surfaces.interface import interface_reflection
 from layerjax.transport.contract import TEXELS, DeterministicTransport, Side, refuse_vmf
+from layerjax.transport.known_directions import Known
 from layerjax.transport.statistical.coated_base import is_coated, make_coated
 from layerjax.transport.statistical.diffuse_base import make_diffuse
 from layerjax.transport.statistical.diffuse_lobe import make_diffuse_lobe, why_no_lobe
@@ -153,6 +154,10 @@ class Statistical(DeterministicTransport):
             else:
                 diffuse = _closed_form(stack)
         return Lit(stack, diffuse, index_below(stack), reference_index(stack), smooth_parts(stack))
+
+    def for_tracing(self, stack: Stack, known: Known) -> "Statistical | None":
+        """Itself, but where alphas are known to be as narrow as can be, which are traced as any others would be."""
+        return None if any(smooth_parts(stack)) or self._solves(stack) else self
 
     def evaluate(self, state: Lit, wi: Vector, wo: Vector, side: Side) -> Channels:
         def lobes(stack: Stack) -> Channels:
