@@ -40,7 +40,11 @@ def turbid(x):
     return lj.Stack([lj.TurbidMedium(0.5, x["thickness"], x["alpha"])], lj.Lambertian(x["base"]))
 
 
-STACKS = {"coat": coat, "slab": slab, "haze": haze, "turbid": turbid}
+def varnish(x):
+    return lj.Stack([lj.Interface(x["ior"], x["alpha"])], lj.Lambertian(x["base"]))
+
+
+STACKS = {"coat": coat, "slab": slab, "haze": haze, "turbid": turbid, "varnish": varnish}
 AT = {"ior": 1.5, "alpha": 0.2, "thickness": 0.7, "albedo": 0.9, "base": 0.4}
 
 
@@ -192,9 +196,17 @@ def test_many_numbers_and_large_batches_are_differentiated_on_the_way_back():
     assert seen == [True, False, False, False, False, False]
 
 
-@pytest.mark.parametrize("name", ["haze", pytest.param("coat", marks=pytest.mark.slow)])
-def test_statistical_has_the_rule_too(name, ruled):
-    function = total(name, lj.Statistical())
+@pytest.mark.parametrize(
+    ("name", "transport"),
+    [
+        ("haze", lj.Statistical()),
+        pytest.param("coat", lj.Statistical(), marks=pytest.mark.slow),
+        ("haze", lj.SpongeCake()),
+        ("varnish", lj.WeidlichWilkie()),
+    ],
+)
+def test_published_models_have_the_rule_too(name, transport, ruled):
+    function = total(name, transport)
     same(jax.value_and_grad(function)(AT), jax.jit(jax.value_and_grad(function))(AT))
     assert len(ruled) == 1
 
