@@ -33,7 +33,15 @@ from fits.optimise.multi_start import (
     unit_of,
 )
 from fits.optimise.options import DEFAULT, FitOptions
-from fits.optimise.resolution import Accuracy, has_rays, leaves_rays_open, refined, resolutions, rings_for_starts
+from fits.optimise.resolution import (
+    FAR_RINGS,
+    Accuracy,
+    has_rays,
+    leaves_rays_open,
+    refined,
+    resolutions,
+    rings_of_lobes,
+)
 from fits.optimise.result import OUTCOMES, Fit, Minimum, WithoutDiscrepancy
 from fits.optimise.uncertainty import UNCONSTRAINED_BEYOND
 from fits.problem.instrument import Instrument
@@ -224,7 +232,12 @@ def _fit_from(
     open_rays = {name for name, one in problem.problems.items() if leaves_rays_open(one)}
     coarse = {name: replace(problem.problems[name], transport=one.far) for name, one in known.items() if one.open}
     problem = problem.with_problems(coarse)
-    problem = problem.with_problems({name: rings_for_starts(problem.problems[name]) for name in open_rays})
+    for name in open_rays:
+        one = problem.problems[name]
+        rings = min(rings_of_lobes(one, one.start), FAR_RINGS)
+        problem = problem.with_problems(
+            {name: replace(one, instrument=replace(cast(Any, one.instrument), rings=rings))}
+        )
     if run.screen:
         ends = screened_starts(problem, points)
     elif run.checkpoint is None:

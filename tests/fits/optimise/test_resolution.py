@@ -151,19 +151,12 @@ def test_modes_are_refined_alone_where_nodes_will_do(monkeypatch):
     assert known.in_words(only) == "12 nodes, 24 modes"
     assert known.partly_finer(here, only) == []
 
-    class Alike(resolution_module.Values):
-        """A model that nodes change nothing of: its error falls with the modes."""
-
-        def __init__(self):
-            self._known = {}
-
-        def error(self, transport, other):
-            return abs(36 - transport.modes) / 36 if transport.modes != other.modes else 0.0
+    def error(transport, other):
+        """Of a model that nodes change nothing of: it falls with the modes."""
+        return abs(36 - transport.modes) / 36 if transport.modes != other.modes else 0.0
 
     monkeypatch.undo()
-    needed, error, finest = resolution_module.needed_resolution(
-        known, here, Alike(), DEFAULT.numerical_error, lambda *_: None
-    )
+    needed, error, finest = resolution_module.needed_resolution(known, here, error, DEFAULT.numerical_error)
     assert (needed.nodes, finest) == (12, False)
     assert needed.modes > 30
     assert error <= DEFAULT.numerical_error
