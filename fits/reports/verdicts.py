@@ -16,7 +16,7 @@ import numpy as np
 from fits.data.checks import repeats
 from fits.data.scans import correlation, neighbours
 from fits.data.totals import Totals
-from fits.optimise.limits import instrument_limits, limited_with
+from fits.optimise.limits import instrument_limits
 from fits.optimise.options import FitOptions
 from fits.optimise.result import OUTCOMES
 from fits.optimise.uncertainty import UNCONSTRAINED_BEYOND, UNIDENTIFIED_BEYOND, Direction
@@ -201,7 +201,7 @@ def identifiability(fit: "Fit", options: ReportOptions = DEFAULT) -> dict[str, s
     """
     names, correlation = list(fit.values), np.array(fit.correlation, dtype=float)
     np.fill_diagonal(correlation, 0.0)
-    limits, limited = instrument_limits(fit), limited_with(fit)
+    limits = instrument_limits(fit)
     words = {}
     for index, name in enumerate(names):
         width, error = float(fit.problem.high[index] - fit.problem.low[index]), fit.standard_errors[name]
@@ -213,8 +213,6 @@ def identifiability(fit: "Fit", options: ReportOptions = DEFAULT) -> dict[str, s
             words[name] = f"limited by the instrument: alpha below {limits[name]:.2g}"
         elif name in fit.at_bound:
             words[name] = "at a bound"
-        elif name in limited:
-            words[name] = f"limited by the instrument: correlated with {limited[name][0]}"
         elif math.hypot(*along) > UNIDENTIFIED_BEYOND:
             kind = "unidentified" if math.hypot(*along) > UNCONSTRAINED_BEYOND else "weakly identified"
             words[name] = f"{kind}: see direction {int(np.argmax(along)) + 1}"

@@ -314,7 +314,9 @@ def test_a_smooth_process_has_a_root_in_single_precision() -> None:
     process = make_process(MANY["six incidences"].wi, MANY["six incidences"].wo)
     white = np.random.default_rng(0).standard_normal((1, len(process.where)))
     double, single = (
-        jax.tree.map(lambda x, kind=kind: jnp.asarray(x, kind), (process, white, Correlation(0.1, 40.0, 40.0, 1.0, 0.0)))
+        jax.tree.map(
+            lambda x, kind=kind: jnp.asarray(x, kind), (process, white, Correlation(0.1, 40.0, 40.0, 1.0, 0.0))
+        )
         for kind in (jnp.float64, jnp.float32)
     )
     found, rough = (one.sample(numbers, at) for one, numbers, at in (double, single))

@@ -222,7 +222,7 @@ def test_files_say_which():
     free = {"start": 2.0, "low": 0.1, "high": 14.0}
     layer = {"kind": "Interface", "ior": 1.5, "alpha": free, "distribution": "vmf"}
     assert stack_from_dict({"layers": [layer]}).layers[0].alpha == fits.Free(2.0, 0.1, 14.0)
-    with pytest.raises(ValueError, match=r"layers\[0\]\.alpha\.start is 2, must be a number in \[0\.0001, 1\]"):
+    with pytest.raises(ValueError, match=r"layers\[0\]\.alpha\.start is 2.0, must be a number in \[0\.0001, 1\]"):
         stack_from_dict({"layers": [layer | {"distribution": "ggx"}]})
 
 
