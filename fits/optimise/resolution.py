@@ -44,8 +44,7 @@ LEAST_SCATTER = 0.01
 is enough, which `AddingDoubling` aims at."""
 
 SAME_OUTCOME, MOST_MINIMA = 0.01, 8
-"""Of the box: ends that are closer in every parameter are fitted again as one; and the most that are, other than those
-that turn out to be the best."""
+"""Of the box: ends that are closer in every parameter are fitted again as one; and the most that are."""
 
 Floats = NDArray[np.float64]
 
@@ -334,38 +333,25 @@ def _fitted_again(
 ) -> list[StartOutcome]:
     """The ends at another resolution: those that matter fitted again, the cost of the others there."""
 
-    def cost(end: StartOutcome) -> float:
+    def with_cost(end: StartOutcome) -> StartOutcome:
         found = float(problem.call(Model.cost_at, end.vector, problem.predict(end.vector)))
-        return found if np.isfinite(found) else np.inf
+        return end._replace(cost=found if np.isfinite(found) else np.inf)
 
-    # 1. ends that lie close together count as one, lowest first
-    groups: list[list[int]] = []
-    units = [unit_of(at.problem, end.vector) for end in at.ends]
+    result, lowest = list(at.ends), with_cost(at.lowest)
+    shift = abs(lowest.cost - at.lowest.cost)  # by so much costs may move
+    units, fitted = [unit_of(at.problem, end.vector) for end in at.ends], list[int]()
     for index in sorted(range(len(at.ends)), key=lambda index: (index != at.best, at.ends[index].cost)):
-        if np.isfinite(at.ends[index].cost):
-            near = (group for group in groups if np.max(np.abs(units[index] - units[group[0]])) < SAME_OUTCOME)
-            if (group := next(near, None)) is None:
-                groups.append(group := [])
-            group.append(index)
-    # 2. those matter whose cost is no farther above the lowest than that may move
-    before = [at.ends[group[0]] for group in groups]
-    ends = [end._replace(cost=cost(end)) for end in before]
-    moved = np.abs([new.cost - old.cost for new, old in zip(ends, before, strict=True)])
-    above = np.array([end.cost - before[0].cost for end in before])
-    matter = np.flatnonzero(~(above > equivalent * at.excess + np.fmax(moved, moved[0])))
-    # 3. they are fitted again, and then what is lowest until it was
-    wanted, fitted, done = [int(index) for index in matter[:MOST_MINIMA]], set[int](), 0
-    while wanted:
-        for index in wanted:
-            end = rough_descent(problem, unit_of(problem, before[index].vector), False)
-            ends[index] = end._replace(steps=before[index].steps + end.steps)
-            fitted.add(index)
-            done += 1
-            progress(f"fit at {words}", done, len(fitted | set(wanted)), f"best cost {min(e.cost for e in ends):.6g}")
-        lowest = int(np.argmin([end.cost for end in ends]))
-        wanted = [] if lowest in fitted else [lowest]
-    result = list(at.ends)
-    for group, end in zip(groups, ends, strict=True):
-        for index in group:
-            result[index] = end
+        before = at.ends[index]
+        near = (other for other in fitted if np.max(np.abs(units[index] - units[other])) < SAME_OUTCOME)
+        if (other := next(near, None)) is not None:
+            result[index] = result[other]
+        elif np.isfinite(before.cost):
+            result[index] = with_cost(before)
+            above, moved = result[index].cost - lowest.cost, abs(result[index].cost - before.cost)
+            if len(fitted) < MOST_MINIMA and not above > equivalent * at.excess + np.fmax(moved, shift):
+                end = rough_descent(problem, units[index], fresh=False)
+                result[index] = end._replace(steps=before.steps + end.steps)
+                fitted.append(index)
+                best = min(end.cost for end in result)
+                progress(f"fit at {words}", len(fitted), None, f"best cost {best:.6g}")
     return result

@@ -115,10 +115,6 @@ class Model(eqx.Module):
         """Half the sum of squared residuals."""
         return 0.5 * jnp.sum(jnp.stack([jnp.sum(part**2) for part in self.residuals_at(vector, predicted)]))
 
-    def log_likelihood_per_datum(self, vector: Array) -> Array:
-        """`log_likelihood_per_datum_at` what these parameters predict."""
-        return self.log_likelihood_per_datum_at(vector, self.predict(vector))
-
     def log_likelihood(self, vector: Array) -> Array:
         """Normalised log-likelihood of all data."""
         return self.log_likelihood_at(vector, self.predict(vector))
@@ -161,32 +157,31 @@ class Model(eqx.Module):
         return total_sigma(predicted, self.variance, parts.relative, parts.floor)
 
     def standardised_at(self, vector: Array, predicted: Array) -> Array:
-        """(datum - model) / sigma, (N, C); for a named objective: datum minus model in its own measure."""
+        """(datum - model) / sigma, (N, C): with model discrepancy of the `logarithm`, in units of the datum's noise.
+
+        For a named objective: datum minus model in its own measure.
+        """
         if self.objective != "likelihood":
             return -self._named(predicted)
-        return (self.values - predicted) / self.sigma_at(vector, predicted)
+        sigma = self._noise_at(vector, predicted)
+        return (self.values - predicted) / sigma if self.process is None else -self._scaled(sigma, predicted)
 
-    def offsets_at(self, vector: Array, predicted: Array) -> Array:
-        """`standardised_at`; with model discrepancy, of the `logarithm` in units of the datum's noise."""
-        if self.process is None:
-            return self.standardised_at(vector, predicted)
-        return -self._relative_at(self._noise_at(vector, predicted)) * self._change(predicted)
-
-    def offsets_after_discrepancy_at(self, vector: Array, predicted: Array) -> Array:
-        """`offsets_at`, less the model discrepancy that the data imply."""
+    def after_discrepancy_at(self, vector: Array, predicted: Array) -> Array:
+        """`standardised_at`, less the model discrepancy that the data imply."""
         if self.process is None:
             return self.standardised_at(vector, predicted)
         return -self.whitened_at(vector, predicted).residuals
 
     def whitened_residuals_at(self, vector: Array, predicted: Array) -> Array:
-        """`offsets_at` by the root of their covariance: under the assumed model independent, with variance 1."""
+        """`standardised_at` by the root of their covariance: under the assumed model independent, with variance 1."""
+        found = self.standardised_at(vector, predicted)
         if self.process is None:
-            return self.standardised_at(vector, predicted)
+            return found
         relative = self._relative_at(self._noise_at(vector, predicted))
-        return -self.process.whitened_residuals(relative * self._change(predicted), relative, self._correlation(vector))
+        return self.process.whitened_residuals(found, relative, self._correlation(vector))
 
     def chi_square_at(self, vector: Array, predicted: Array) -> Array:
-        """z'S^-1 z of `offsets_at` z, with S their covariance: 1 without model discrepancy."""
+        """z'S^-1 z of `standardised_at` z, with S their covariance: 1 without model discrepancy."""
         if self.process is None:
             return jnp.sum(self.standardised_at(vector, predicted) ** 2)
         found = self.whitened_at(vector, predicted)
@@ -195,8 +190,9 @@ class Model(eqx.Module):
     def whitened_at(self, vector: Array, predicted: Array, step: Step = None) -> Whitened:
         """Residuals less the model discrepancy that the data imply, by the scale of the noise."""
         assert self.process is not None
-        relative = self._relative_at(self._noise_at(vector, predicted, step))
-        return self.process.whitened(relative * self._change(predicted), relative, self._correlation(vector, step))
+        sigma = self._noise_at(vector, predicted, step)
+        at = self._correlation(vector, step)
+        return self.process.whitened(self._scaled(sigma, predicted), self._relative_at(sigma), at)
 
     def discrepancy_at(self, vector: Array, predicted: Array, places: Array) -> tuple[Array, Array]:
         """The model discrepancy at other `places`, as far as the data tell: mean and sd of the logarithm, (M, C)."""
@@ -273,9 +269,10 @@ class Model(eqx.Module):
         """An error of 1 in a logarithm, in units of the noise, (N, C)."""
         return size(self.values, self.softness) / sigma
 
-    def _change(self, predicted: Array) -> Array:
-        """Logarithms of what is predicted less those of the data, (N, C)."""
-        return logarithm(predicted, self.softness) - logarithm(self.values, self.softness)
+    def _scaled(self, sigma: Array, predicted: Array) -> Array:
+        """Logarithms of what is predicted less those of the data, in units of the noise, (N, C)."""
+        change = logarithm(predicted, self.softness) - logarithm(self.values, self.softness)
+        return self._relative_at(sigma) * change
 
     def _correlation(self, vector: Array, step: Step = None) -> Correlation:
         at = self.build(vector).correlation
@@ -340,8 +337,7 @@ class JointModel(eqx.Module):
     varying: bool = eqx.field(static=True)
 
     residuals, cost_at, log_prior = Model.residuals, Model.cost_at, Model.log_prior
-    log_likelihood, log_likelihood_per_datum = Model.log_likelihood, Model.log_likelihood_per_datum
-    log_posterior_unconstrained = Model.log_posterior_unconstrained
+    log_likelihood, log_posterior_unconstrained = Model.log_likelihood, Model.log_posterior_unconstrained
 
     @property
     def objective(self) -> Objective:

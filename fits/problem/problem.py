@@ -31,7 +31,7 @@ from fits.problem.discrepancy import Discrepancy, Process, make_process, numbers
 from fits.problem.hemispherical import Totalling
 from fits.problem.instrument import Instrument, optics_of, setting_of
 from fits.problem.model import JointModel, Model, Transport
-from fits.problem.noise import Levels, Noise, is_assumed, noise_levels, require_size
+from fits.problem.noise import Levels, Noise, is_assumed, noise_levels
 from fits.problem.parameters import Box, Free, LogNormal, Normal, is_free, names_of, require_in_range, split
 from layerjax._checks import in_short, require_choice, require_kind, require_number
 from layerjax._parameters import plain_name
@@ -152,17 +152,9 @@ class FittingProblem(abc.ABC):
         """Normalised log-likelihood of the used samples with the physical vector (P,)."""
         return self.call(Model.log_likelihood, vector)
 
-    def log_likelihood_per_datum(self, vector: ArrayLike) -> Array:
-        """Normalised log-density of each datum with the physical vector (P,), (N, C)."""
-        return self.call(Model.log_likelihood_per_datum, vector)
-
     def log_prior(self, vector: ArrayLike) -> Array:
         """Log-density of the physical vector, -inf outside the bounds."""
         return self.call(Model.log_prior, vector)
-
-    def log_posterior_unconstrained(self, u: ArrayLike) -> Array:
-        """Log-posterior over the unconstrained vector (P,), -inf where undefined."""
-        return self.call(Model.log_posterior_unconstrained, u)
 
     def call(self, function: Callable[..., Any], *arguments: Any) -> Any:
         """`function(model, *arguments)`, compiled once for all of this structure; of a method of `Model` the model's
@@ -248,7 +240,7 @@ class Problem(FittingProblem):
         wi, wo = np.asarray(wi, float), np.asarray(wo, float)
         model = replace(self.model, **_directions(self, wi, wo))
         arrays, static = eqx.partition(model, eqx.is_array)
-        return run(_predictions, (arrays, Static(static)), jnp.asarray(vectors))
+        return run(_predict_each, (arrays, Static(static)), jnp.asarray(vectors))
 
     def with_other_rays(self) -> "Problem":
         """The problem with other numbers of rays for the cones of its instrument: what differs is their error."""
@@ -264,6 +256,10 @@ class Problem(FittingProblem):
         other = replace(self)
         vars(other)["_assembled"] = self._assembled._replace(model=model)
         return other
+
+
+def _predict_each(model: Model, vectors: Array) -> Array:
+    return jax.lax.map(model.predict, vectors)
 
 
 class JointParts(NamedTuple):
@@ -448,7 +444,6 @@ def _require_kinds(problem: Problem) -> None:
 def _require_weights(objective: Objective, levels: Levels, process: Process | None, free: Mapping[str, Free]) -> None:
     """A likelihood needs noise; beside a named residual nothing may stand that only a likelihood weighs."""
     if objective == "likelihood":
-        require_size(levels)
         if not np.all(levels.smallest > 0):
             raise ValueError("noise: sigma could become 0; give a floor above 0, or data with sigma")
         return
@@ -502,10 +497,6 @@ def polar_angles(data: Measurements) -> Floats:
     azimuths."""
     theta = data.used().theta_i
     return np.round([np.mean(theta[rows]) for rows in groups(theta)], 2)
-
-
-def _predictions(model: Model, vectors: Array) -> Array:
-    return jax.lax.map(model.predict, vectors)
 
 
 def unit(name: str) -> str:

@@ -154,7 +154,7 @@ def assess(fit: "Fit", options: ReportOptions = DEFAULT) -> Assessment:
             ordered = np.sort(np.maximum(ratio, 1.0 / ratio))
         misfit = float(ordered[len(ordered) // 2]), float(ordered[int(0.95 * len(ordered))])
     if likelihood:
-        offsets = np.abs(np.asarray(fit.problem.call(Model.offsets_at, fit.vector, fit.predicted), float))
+        offsets = np.abs(np.asarray(fit.problem.call(Model.standardised_at, fit.vector, fit.predicted), float))
         square = float(np.sum(offsets**2))  # by these parameters
         significant = fit.degrees_of_freedom > 0 and square / freedom - 1.0 > options.significance * spread
         described = not (significant and float(np.median(offsets)) > options.misfit)

@@ -77,21 +77,6 @@ def test_shares_are_recovered(file: Path) -> None:
     assert np.sum(np.abs(pulls[:, NAMES.index("weights.dust")]) < 3.0) >= 98
 
 
-@pytest.mark.slow
-def test_all_orders_choose_one_resolution_for_all_parts() -> None:
-    def mixed(alpha, weight) -> lj.Mixture:
-        coat = lj.Stack([lj.Interface(1.5, alpha)], lj.Lambertian(0.3))
-        return lj.Mixture({"coat": coat, "bare": lj.Stack([], lj.Lambertian(0.5))}, [weight, None])
-
-    data = fits.simulate(mixed(0.2, 0.7), GEOMETRY, lj.AddingDoubling(nodes=16, modes=24), 0.02, 1e-4)
-    free = mixed(Free(0.3, 0.1, 0.8), Free(0.5, 0.0, 1.0))
-    found = fits.fit(free, data, starts=2, noise=fits.Noise(discrepancy=False))
-    assert found.numerical_error is not None
-    assert found.numerical_error < 0.1
-    for name, value in (("weights.coat", 0.7), ("coat.layers[0].alpha", 0.2)):
-        assert abs(found.values[name] - value) < 4.0 * found.standard_errors[name]
-
-
 WEIGHT = "weight = { start = 0.5, low = 0.0, high = 1.0 }"
 
 

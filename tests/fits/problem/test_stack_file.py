@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import layerjax as lj
+from fits.optimise.options import FitOptions, options_from
 from fits.problem.discrepancy import Discrepancy
 from fits.problem.instrument import Instrument
 from fits.problem.noise import Noise
@@ -48,6 +49,8 @@ prior = { kind = "LogNormal", median = 1.0, sd = 0.05 }
 [instrument]
 detector_aperture = 2.0
 tilt = { start = 0.0, low = -1.0, high = 1.0 }
+[options]
+autocorrelation = 0.4
 """
 INSTRUMENT = Instrument(detector_aperture=2.0, tilt=Free(0.0, -1.0, 1.0))
 BASE = 'base = { kind = "Lambertian", albedo = 0.5 }\n'
@@ -82,6 +85,7 @@ def test_everything_in_a_file_arrives_and_is_written_again(tmp_path):
     assert (problem.objective, problem.instrument) == ("cube_root", INSTRUMENT)
     assert problem.about == {"source": "a paper", "remark": "kept as it is"}
     assert problem.text == FULL
+    assert options_from(problem.options) == FitOptions(autocorrelation=0.4)
 
     path = tmp_path / "again.toml"
     names = ("transport", "noise", "scale", "objective", "instrument")
