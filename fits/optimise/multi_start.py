@@ -29,17 +29,15 @@ from layerjax._numerics import broadcasting
 
 Floats = NDArray[np.float64]
 
-MOST_STEPS = 200
-MOST_ROUNDS = 20
-LBFGSB_STEPS, LBFGSB_TOLERANCE = 500, 1e-12
+MOST_STEPS, MOST_ROUNDS = 200, 20
+"""Of a start, and how many times so many, while a round of them gains `LEAST_GAIN`."""
+LEAST_GAIN, LEAST_RELATIVE_GAIN = 1e-3, 1e-6
+"""In the log-posterior; and for a named objective, as a share of the cost."""
 EARLY, FRONT = 20, 3
 """Steps, with sigma held and with it free, after which starts are screened, and how many of them are continued."""
-LEAST_GAIN = 1e-3
-"""A start that reached the maximum of steps is continued while a round of them gains this in the log-posterior."""
-LEAST_STEP_GAIN = 1e-5
-"""The check by L-BFGS-B ends where a step of it gains less than this in the log-posterior."""
-LEAST_RELATIVE_GAIN = 1e-6
-"""The same for a named objective, as a share of the cost."""
+LBFGSB_STEPS, LBFGSB_TOLERANCE, LEAST_STEP_GAIN = 500, 1e-12, 1e-5
+"""The check by L-BFGS-B ends after so many steps; where the gradient of a named objective is below the second; where a
+step gains less than the last in the log-posterior."""
 
 
 class StartOutcome(NamedTuple):
@@ -72,15 +70,15 @@ def multi_start(
     """Where each of the points (starts, P) in the unit box ends, roughly; those that are in the store are not run."""
     ends: dict[int, StartOutcome] = {}
 
-    def ended(index: int, end: StartOutcome, new: bool = True) -> None:
+    def ended(index: int, end: StartOutcome) -> None:
         ends[index] = end
-        if store is not None and new:
+        if store is not None and store.get(f"start {index}") is None:
             store.put(f"start {index}", end._asdict())
         progress("fit", len(ends), len(points), f"best cost {min(end.cost for end in ends.values()):.6g}")
 
     for index in range(len(points)):
         if store is not None and (stored := store.get(f"start {index}")) is not None:
-            ended(index, StartOutcome(**stored), new=False)
+            ended(index, StartOutcome(**stored))
     left = [index for index in range(len(points)) if index not in ends]
     for index in left[:1]:  # alone: it compiles the program, which keeps one core busy
         ended(index, rough_descent(problem, points[index]))
@@ -221,8 +219,8 @@ def polish(
 ) -> Optimum:
     """The lowest of the ends, followed to its very minimum, and checked by L-BFGS-B where it has not converged.
 
-    check: also where a parameter lies on a bound or has no influence. It takes a hundred steps: what begins at a
-    minimum that was checked goes without. tolerance: how far it is followed, see `descend`.
+    check: also where a parameter lies on a bound. It takes a hundred steps: what begins at a minimum that was checked
+    goes without. tolerance: how far it is followed, see `descend`.
     """
     best, improved = int(np.argmin([end.cost for end in ends])), False
     lowest, likelihood = ends[best], problem.objective == "likelihood"
@@ -232,25 +230,16 @@ def polish(
         if closer.cost <= lowest.cost:
             lowest = closer._replace(steps=lowest.steps + closer.steps)
     found = uncertainty(problem, lowest.vector, lowest.cost)
-    # 2. no step leads off a plateau, where every start may end though another minimum is far lower: insensitive
-    # parameters and those at a bound begin anew
-    if check and found.insensitive:
-        stuck = np.isin(problem.names, found.insensitive) | found.at_bound
-        point = np.where(stuck, unit_of(problem, problem.start), unit_of(problem, lowest.vector))
-        other = least_squares_descent(problem, point, tolerance=tolerance)
-        if other.cost < lowest.cost - (ROUGH_TOLERANCE if likelihood else LEAST_RELATIVE_GAIN * lowest.cost):
-            lowest = other._replace(steps=lowest.steps + other.steps)
-            found = uncertainty(problem, lowest.vector, lowest.cost)
-    # 3. checked by L-BFGS-B
+    # 2. checked by L-BFGS-B
     if (check and found.at_bound.any()) or not lowest.converged:
         lowest, improved = lbfgsb_polish(problem, lowest)
         found = uncertainty(problem, lowest.vector, lowest.cost) if improved else found
-    # 4. exactly on the bounds that hold it
+    # 3. exactly on the bounds that hold it
     low, high, held, vector = problem.low, problem.high, found.at_bound, lowest.vector
     nearest = np.where(vector - low < high - vector, low, high)
     lowest = lowest._replace(vector=np.where(held, nearest, np.clip(vector, low, high)))
     predicted = evaluate_at(problem, unit_of(problem, lowest.vector)).predicted if held.any() else found.predicted
-    # 5. the reduced chi-square where it is above 1; of a named objective, the residual variance
+    # 4. the reduced chi-square where it is above 1; of a named objective, the residual variance
     freedom = max(problem.count - len(lowest.vector), 1)
     if likelihood:
         excess = max(1.0, float(problem.call(Model.chi_square_at, lowest.vector, predicted)) / freedom)

@@ -169,36 +169,23 @@ class Free:
     __layerjax_placeholder__: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
-        if self.prior is None:
-            object.__setattr__(self, "prior", Uniform())
         require_kind("Free.prior", self.prior, Uniform, LogUniform, Normal, LogNormal)
         require_switch("Free.same_for_all_texels", self.same_for_all_texels)
         for field in ("start", "low", "high", "random_walk_sd"):
             if (value := getattr(self, field)) is not None or field != "random_walk_sd":
                 object.__setattr__(self, field, _plain(f"Free.{field}", value))
         first, lower, upper = self.arrays()
+        low, high = in_short(self.low), in_short(self.high)
         if np.any(lower >= upper):
-            raise ValueError(
-                f"Free.low is {in_short(self.low)} and Free.high is {in_short(self.high)}; low must be below high"
-            )
+            raise ValueError(f"Free.low is {low} and Free.high is {high}; low must be below high")
         if np.any((first < lower) | (first > upper)):
-            raise ValueError(
-                f"Free.start is {in_short(self.start)}; it must lie in [{in_short(self.low)}, {in_short(self.high)}]"
-            )
+            raise ValueError(f"Free.start is {in_short(self.start)}; it must lie in [{low}, {high}]")
         _require_computable(self.prior, lower, upper)
-        if self.random_walk_sd is None:
-            return
-        steps, shape = np.asarray(self.random_walk_sd), self.shape
-        if not shape or shape[0] < 2:
-            raise ValueError(
-                "Free.random_walk_sd is given for a single number; start, low or high must have two channels"
-            )
-        if steps.shape not in ((), (shape[0] - 1,)):
-            raise ValueError(
-                f"Free.random_walk_sd has {steps.size} entries; it must have 1 or {shape[0] - 1}, one a step"
-            )
-        if not np.all(steps > 0.0):
-            raise ValueError(f"Free.random_walk_sd is {in_short(steps.tolist())}; it must be above 0")
+        if self.random_walk_sd is not None:
+            steps, count = np.asarray(self.random_walk_sd), math.prod(self.shape) - 1
+            if not (count and steps.shape in ((), (count,)) and np.all(steps > 0.0)):
+                words = f"must be above 0, one number or one for each of the {count} steps between channels"
+                raise ValueError(f"Free.random_walk_sd is {in_short(self.random_walk_sd)}; it {words}")
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -214,13 +201,11 @@ class Free:
 
     def arrays(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """`start`, `low`, `high` at their common shape."""
+        given = self.start, self.low, self.high
         try:
-            start, low, high = np.broadcast_arrays(*(np.asarray(x, float) for x in (self.start, self.low, self.high)))
+            start, low, high = np.broadcast_arrays(*(np.asarray(one, float) for one in given))
         except ValueError:
-            raise ValueError(
-                f"Free: start {in_short(self.start)}, low {in_short(self.low)} and high {in_short(self.high)} have "
-                "different numbers of channels"
-            ) from None
+            raise ValueError(f"Free: {in_short(given)} have different numbers of channels") from None
         return start, low, high
 
 
@@ -228,11 +213,9 @@ def _plain(field: str, value: Any) -> float | tuple[float, ...]:
     try:
         array = np.asarray(value, dtype=float)
     except (TypeError, ValueError, OverflowError):
-        raise ValueError(f"{field} is {in_short(value)}; it must be a number or one number per channel") from None
-    if array.ndim > 1 or array.size == 0:
-        raise ValueError(f"{field} has shape {array.shape}; it must be a number or one number per channel")
-    if not np.isfinite(array).all():
-        raise ValueError(f"{field} is {in_short(array.tolist())}; it must be finite")
+        array = np.zeros(0)
+    if array.ndim > 1 or array.size == 0 or not np.isfinite(array).all():
+        raise ValueError(f"{field} is {in_short(value)}; it must be a finite number or one per channel")
     return float(array) if array.ndim == 0 else tuple(array.tolist())
 
 

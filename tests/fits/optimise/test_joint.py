@@ -16,7 +16,7 @@ from fits.prediction.importance import evidence
 from fits.prediction.predict import predict
 from fits.problem.discrepancy import Discrepancy
 from fits.problem.noise import Noise
-from fits.problem.parameters import Free, LogNormal, Normal
+from fits.problem.parameters import Free, LogNormal, Normal, Uniform
 from fits.problem.problem import Joint, Problem
 from fits.reports.results import save_fit
 from fits.sampling.posterior import Posterior
@@ -36,7 +36,10 @@ def data(name):
     return measured((design(COUNTS[name]) @ TRUE[name])[:, None] + SIGMA[name] * noise, SIGMA[name])
 
 
-def problem(name, prior=None):
+FLAT = Uniform()
+
+
+def problem(name, prior=FLAT):
     return Problem({"a": Free(0.9, -1.0, 3.0), "b": Free(0.1, -1.0, 3.0, prior)}, data(name), line)
 
 
