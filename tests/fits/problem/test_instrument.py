@@ -154,7 +154,7 @@ def width_of(alpha: float) -> float:
     return 4.0 * np.degrees(np.arctan(0.6436 * alpha))
 
 
-@pytest.mark.parametrize("ratio", [0.2, 0.7, 1.0, 1.4, 3.0])
+@pytest.mark.parametrize("ratio", [0.2, 1.0, 1.4, 3.0])
 @pytest.mark.parametrize("split", [(0.0, 1.0), (0.6, 0.8)])
 def test_readings_are_right_to_a_thousandth_of_the_peak(ratio: float, split: tuple[float, float]) -> None:
     alpha = 0.02

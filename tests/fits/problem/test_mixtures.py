@@ -85,7 +85,6 @@ WEIGHT = "weight = { start = 0.5, low = 0.0, high = 1.0 }"
     [
         ("high = 1.0 }\n[[", "high = 1.2 }\n[[", r"mixture.dust.weight.high is 1.2, must be a number in \[0, 1\]"),
         ("weight = {", "weight = 0.3\nwait = {", r"mixture.dust has an unknown key 'wait' \(did you mean 'weight'\?\)"),
-        ('kind = "Medium"', 'kind = "Medum"', r"mixture.dust.layers\[0\].kind is 'Medum'"),
         ("albedo = 0.1", "albedo = 1.1", r"mixture.dust.base: Lambertian.albedo: 1.1 is outside \[0, 1\]"),
         ("[mixture.metal.base]", "[mixture.metal]\nweight = 0.2\n[mixture.metal.base]", "one has to be free of choice"),
         ("[mixture.metal.base]", "[base]", "mixture is a whole material, must stand without base"),

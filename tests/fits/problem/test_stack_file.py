@@ -108,24 +108,13 @@ def test_everything_in_a_file_arrives_and_is_written_again(tmp_path):
         assert read_problem(path).noise == Noise(0.03, discrepancy=given)
 
 
-# of one's own: a file could name them, but nothing could read them back
-Ghost, Painted, Careful = (
-    type(name, (kind,), {})
-    for name, kind in (("Ghost", lj.Rayleigh), ("Painted", lj.Lambertian), ("Careful", lj.SingleScattering))
-)
-
-
-@pytest.mark.parametrize(
-    ("stack", "transport", "message"),
-    [
-        (lj.Stack([lj.Interface(1.5, 0.1), lj.Medium(1.0, phase=Ghost())]), "auto", r"layers\[1\]\.phase\.kind is 'Gh"),
-        (lj.Stack([], Painted(0.5)), "auto", r"base\.kind is 'Painted', must be one of Lambertian, "),
-        (lj.Stack([], lj.Lambertian(0.5)), Careful(), r"transport is 'Careful', must be one of "),
-    ],
-)
-def test_what_could_not_be_read_back_is_not_written(tmp_path, stack, transport, message):
-    with pytest.raises(ValueError, match=message):
-        write_problem(tmp_path / "problem.toml", stack, transport=transport)
+def test_what_could_not_be_read_back_is_not_written(tmp_path):
+    """Classes of one's own: a file could name them, but nothing could read them back."""
+    painted, careful = type("Painted", (lj.Lambertian,), {}), type("Careful", (lj.SingleScattering,), {})
+    with pytest.raises(ValueError, match=r"base\.kind is 'Painted', must be one of Lambertian, "):
+        write_problem(tmp_path / "problem.toml", lj.Stack([], painted(0.5)))
+    with pytest.raises(ValueError, match=r"transport is 'Careful', must be one of "):
+        write_problem(tmp_path / "problem.toml", lj.Stack([], lj.Lambertian(0.5)), transport=careful())
     assert not list(tmp_path.iterdir())
 
 
@@ -185,8 +174,6 @@ def test_bad_files_are_one_line_that_names_the_place(tmp_path, text):
     [
         (b"\xef\xbb\xbf", "there is neither a layer nor a base"),
         (BASE.encode("utf-16"), "not a text file (byte 0 is not UTF-8)"),
-        (bytes(range(128, 256)), "not a text file"),
-        (BASE.encode() + b"\0", "not valid TOML: "),
         (b"base." + b"a." * 2000 + b"b = 1\n", "base has no kind"),
         (b"about = { day = 2020-13-01 }\n", "not valid TOML: "),
     ],
