@@ -205,35 +205,20 @@ class Model(eqx.Module):
         """Places, among `residuals`, of those whose half squares are logarithms of levels of noise."""
         return tuple(range(2, 2 + self.varying + (self.process is not None)))
 
-    def residuals_at(self, vector: Array, predicted: Array) -> tuple[Array, ...]:
-        """Arrays whose half sum of squares is minus the log-posterior up to a constant, or the named objective.
-
-        The first of them is of the data, the second of the prior, those that are left of levels of noise (see
-        `logarithmic`).
-        """
-        return self._residuals(vector, predicted)
-
     def initial_sigma(self, vector: Array) -> Array:
         """A scale of the noise, (N, C), in 1/sr, by which no measurement near 0 stands out: a fit begins with it."""
         parts = self.build(vector)
         typical = jnp.mean(jnp.abs(self.values))  # a tenth of it keeps data near 0 from outweighing all others
         return total_sigma(jnp.abs(self.values) + 0.1 * typical, self.variance, parts.relative, parts.floor)
 
-    def linear_parts(
-        self, vector: Array, first_step: Step = None, others: bool = False
-    ) -> tuple[tuple[Array, ...], tuple[Array, Array]]:
+    def linear_parts(self, vector: Array, step: Step = None) -> tuple[tuple[Array, ...], tuple[Array, Array]]:
         """`residuals`; and what is predicted, (N, C), with the rows (rows,) of the data's Fisher information.
 
         The Jacobian A of these rows has the Fisher information A'A. The expected information needs first derivatives
         only and is never indefinite; for Gaussian noise that is known it is J'J. For a named objective: its residuals.
-
-        first_step: see `Step`. others: whether derivatives are also by parameters that nothing
-        depends on here.
         """
-        alone = self.moving == vector.size and not others
-        predicted = self.predict(vector) if alone else _by_columns(vector, model=self)
-        rows = self._information_rows(vector, predicted, first_step)
-        return self._residuals(vector, predicted, first_step), (predicted, rows)
+        predicted = _by_columns(vector, model=self)
+        return self.residuals_at(vector, predicted, step), (predicted, self._information_rows(vector, predicted, step))
 
     def log_likelihood_per_datum_at(self, vector: Array, predicted: Array) -> Array:
         """Normalised log-density of each datum, (N, C); with model discrepancy, given all others."""
@@ -279,7 +264,9 @@ class Model(eqx.Module):
         assert at is not None
         return at if step is None else at._replace(amplitude=step[1] * at.amplitude)
 
-    def _residuals(self, vector: Array, predicted: Array, step: Step = None) -> tuple[Array, ...]:
+    def residuals_at(self, vector: Array, predicted: Array, step: Step = None) -> tuple[Array, ...]:
+        """Arrays whose half sum of squares is minus the log-posterior up to a constant, or the named objective: of the
+        data, of the prior, and those of levels of noise (see `logarithmic`)."""
         if self.objective != "likelihood":
             return (self._named(predicted),)
         sigma = self._noise_at(vector, predicted, step)
@@ -374,15 +361,14 @@ class JointModel(eqx.Module):
     def residuals_at(self, vector: Array, predicted: Array) -> tuple[Array, ...]:
         return self._together(vector, self._each(Model.residuals_at, vector, predicted))
 
-    def linear_parts(self, vector: Array, first_step: Step = None) -> tuple[tuple[Array, ...], tuple[Array, Array]]:
+    def linear_parts(self, vector: Array, step: Step = None) -> tuple[tuple[Array, ...], tuple[Array, Array]]:
         """Each data set is differentiated by its own parameters alone."""
-        steps: list[tuple[Array, Array] | None] = [None] * len(self.parts)
-        if first_step is not None:
-            held, shared = first_step
-            sigmas = [held] * len(self.parts) if held.size == 1 else self._split(held)
-            steps = [(sigma, shared) for sigma in sigmas]
+        steps: list[Step] = [None] * len(self.parts)
+        if step is not None:
+            sigmas = [step[0]] * len(self.parts) if step[0].size == 1 else self._split(step[0])
+            steps = [(sigma, step[1]) for sigma in sigmas]
         each = self._with_vectors(vector)
-        found = [part.linear_parts(own, step, others=True) for (part, own), step in zip(each, steps, strict=True)]
+        found = [part.linear_parts(own, step) for (part, own), step in zip(each, steps, strict=True)]
         predicted, rows = _column([values for _, (values, _) in found]), [rows for _, (_, rows) in found]
         return self._together(vector, [residuals for residuals, _ in found]), (predicted, jnp.concatenate(rows))
 

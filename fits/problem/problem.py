@@ -431,15 +431,13 @@ def _require_weights(objective: Objective, levels: Levels, process: Process | No
         if not np.all(levels.smallest > 0):
             raise ValueError("noise: sigma could become 0; give a floor above 0, or data with sigma")
         return
-    fitted = [f"noise.{name}" for name in ("relative", "floor") if is_free(getattr(levels, name))]
-    if fitted or process is not None:
-        raise ValueError(f"{(*fitted, 'noise.discrepancy')[0]}: objective {objective!r} has no noise model to fit")
-    for one in free.values():
-        if isinstance(one.prior, Normal | LogNormal):
-            raise ValueError(f"the prior {one.prior} has no weight beside objective {objective!r}; omit it")
-        if one.random_walk_sd is not None:
-            words = f"Free.random_walk_sd {one.random_walk_sd} has no weight beside objective {objective!r}; omit it"
-            raise ValueError(words)
+    weighed = [f"noise.{name}" for name in ("relative", "floor") if is_free(getattr(levels, name))]
+    weighed += [] if process is None else ["noise.discrepancy"]
+    for name, one in free.items():
+        if isinstance(one.prior, Normal | LogNormal) or one.random_walk_sd is not None:
+            weighed.append(f"the prior of {name}")
+    if weighed:
+        raise ValueError(f"{weighed[0]}: objective {objective!r} weighs neither levels of noise nor priors; omit it")
 
 
 def _with_known(stack: Any) -> Any:

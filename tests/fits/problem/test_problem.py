@@ -197,15 +197,18 @@ LINE_DATA = measured(VALUES)
         (lambda: Problem(STACK, LINE_DATA, line, Noise(relative=0.0, floor=0.0)), "sigma could become 0"),
         (lambda: Problem(STACK, LINE_DATA, line, objective="l1"), "objective: 'l1' is not one of 'likelihood', "),
         (lambda: Problem(STACK, LINE_DATA, line, scale=-1.0), "scale is -1.0"),
-        (lambda: Problem(STACK, LINE_DATA, line, objective="cube_root"), "the prior Normal.* has no weight beside"),
-        (lambda: Problem(WALK, TWO, objective="cosine_l2"), r"Free.random_walk_sd 0.1 has no weight beside objective"),
+        (
+            lambda: Problem(STACK, LINE_DATA, line, objective="cube_root"),
+            r"the prior of \['b'\]: objective 'cube_root' weighs neither",
+        ),
+        (lambda: Problem(WALK, TWO, objective="cosine_l2"), "the prior of base.albedo: objective 'cosine_l2' weighs"),
         (
             lambda: Problem(FLAT, LINE_DATA, line, Noise(relative=Free(0.1, 0.0, 1.0)), objective="cosine_l2"),
-            r"noise\.relative: objective 'cosine_l2' has no noise model",
+            r"noise\.relative: objective 'cosine_l2' weighs neither",
         ),
         (
             lambda: Problem(FLAT, LINE_DATA, line, Noise(discrepancy=True), objective="cube_root"),
-            r"noise\.discrepancy: objective 'cube_root' has no noise model",
+            r"noise\.discrepancy: objective 'cube_root' weighs neither",
         ),
         (lambda: Problem(WALK, replace(TWO, values=TWO.values[:, :1], channels=("a",))), "it has 2 channels, the data"),
         (lambda: Problem(PAINT, DATA, transport=lj.Statistical), r'is not a Transport or "auto"'),
