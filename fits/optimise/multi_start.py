@@ -20,7 +20,7 @@ from scipy.stats import qmc
 import layerjax
 from fits.optimise.levenberg_marquardt import COST_TOLERANCE, ROUGH_TOLERANCE, Descent, descent, evaluate_at
 from fits.optimise.uncertainty import Uncertainty, uncertainty
-from fits.problem.compilation import cores
+from fits.problem.compilation import cores, on_all_cores
 from fits.problem.model import Model
 from fits.problem.problem import FittingProblem
 from fits.progress import Progress
@@ -119,12 +119,10 @@ def screened_starts(problem: FittingProblem, points: Floats) -> list[StartOutcom
         further = rough_descent(problem, unit_of(problem, end.vector), fresh=False)
         return further._replace(steps=end.steps + further.steps)
 
-    first = early(points[0])  # alone: it compiles the program, which keeps one core busy
-    with ThreadPoolExecutor(cores()) as pool:
-        ends = [first, *pool.map(early, points[1:])]
-        front = np.argsort([end.cost for end in ends])[:FRONT]
-        for place, end in zip(front, pool.map(onward, [ends[place] for place in front]), strict=True):
-            ends[place] = end
+    ends = [early(points[0]), *on_all_cores(early, points[1:])]  # the first alone: it compiles the program
+    front = np.argsort([end.cost for end in ends])[:FRONT]
+    for place, end in zip(front, on_all_cores(onward, [ends[place] for place in front]), strict=True):
+        ends[place] = end
     return ends
 
 
