@@ -169,6 +169,8 @@ class Free:
     __layerjax_placeholder__: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
+        if self.prior is None:
+            object.__setattr__(self, "prior", Uniform())
         require_kind("Free.prior", self.prior, Uniform, LogUniform, Normal, LogNormal)
         require_switch("Free.same_for_all_texels", self.same_for_all_texels)
         for field in ("start", "low", "high", "random_walk_sd"):
