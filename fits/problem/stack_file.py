@@ -159,20 +159,13 @@ def write_problem(
     for name, value, kind in (("noise", noise, Noise), ("scale", scale, Free), ("instrument", instrument, Instrument)):
         require_kind(name, value, kind, None)
     choice("objective", objective, get_args(Objective))
-    tables: dict[str, Any] = {}
-    if not isinstance(transport, str):
-        tables["transport"] = transport_to_dict(transport)
-    if objective != "likelihood":
-        tables["objective"] = objective
+    tables = {"transport": transport_to_dict(transport), "objective": objective}
+    tables = {name: value for name, value in tables.items() if value not in ("auto", "likelihood")}
     tables |= material_to_dict(stack)
     material_from_dict(material_to_dict(stack))  # refuses what could not be read again
     transport_from_dict(transport_to_dict(transport))
-    if noise is not None:
-        tables["noise"] = changed_to_dict(noise)
-    if instrument is not None:
-        tables["instrument"] = changed_to_dict(instrument)
-    if scale is not None:
-        tables["scale"] = to_plain(scale)
+    given = {"noise": noise, "instrument": instrument, "scale": scale}
+    tables |= to_plain({name: value for name, value in given.items() if value is not None})
     write_text(path, tomli_w.dumps(tables), force)
 
 
@@ -337,22 +330,16 @@ def _suggestion(value: Any, allowed: Iterable[str]) -> str:
 # ---- to tables ----
 
 
-def material_to_dict(stack: lj.Stack | lj.Mixture) -> dict[str, Any]:
+def material_to_dict(material: lj.Stack | lj.Mixture) -> dict[str, Any]:
     """The inverse of `material_from_dict`, of plain numbers, strings, lists and dictionaries."""
-    if not isinstance(stack, lj.Mixture):
-        return stack_to_dict(stack)
-    weights = {name: {} if value is None else {"weight": to_plain(value)} for name, value in stack.weights.items()}
-    return {"mixture": {name: weights[name] | material_to_dict(part) for name, part in stack.parts.items()}}
-
-
-def stack_to_dict(stack: lj.Stack) -> dict[str, Any]:
-    """The inverse of `stack_from_dict`."""
-    tables: dict[str, Any] = {}
-    if stack.layers:
-        tables["layers"] = [_module_to_dict(layer) for layer in stack.layers]
-    if stack.base is not None:
-        tables["base"] = _module_to_dict(stack.base)
-    return tables
+    if isinstance(material, lj.Mixture):
+        given = {name: {} if value is None else {"weight": value} for name, value in material.weights.items()}
+        parts = {name: material_to_dict(part) for name, part in material.parts.items()}
+        return {"mixture": {name: to_plain(given[name]) | part for name, part in parts.items()}}
+    tables: dict[str, Any] = (
+        {"layers": [_module_to_dict(layer) for layer in material.layers]} if material.layers else {}
+    )
+    return tables if material.base is None else tables | {"base": _module_to_dict(material.base)}
 
 
 def changed_to_dict(thing: Noise | Instrument | Discrepancy | Free) -> dict[str, Any]:
@@ -377,7 +364,9 @@ def _module_to_dict(module: Any) -> dict[str, Any]:
 
 
 def to_plain(value: Any) -> Any:
-    if isinstance(value, Free):
+    if isinstance(value, dict):
+        return {name: to_plain(one) for name, one in value.items()}
+    if isinstance(value, Free | Noise | Instrument):
         return changed_to_dict(value)
     if isinstance(value, str | bool | int):
         return value

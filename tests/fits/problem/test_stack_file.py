@@ -12,7 +12,7 @@ from fits.problem.discrepancy import Discrepancy
 from fits.problem.instrument import Instrument
 from fits.problem.noise import Noise
 from fits.problem.parameters import Box, Free, LogNormal, LogUniform, Normal, PowerLaw, is_free
-from fits.problem.stack_file import read_instrument, read_problem, stack_from_dict, stack_to_dict, write_problem
+from fits.problem.stack_file import material_to_dict, read_instrument, read_problem, stack_from_dict, write_problem
 from tests.helpers import places
 
 EXAMPLES = sorted(places.EXAMPLES.glob("*.toml"))
@@ -130,9 +130,9 @@ def test_dictionary_round_trip():
         lj.Stack([lj.Medium(Free(1.0, 0.1, 10.0, LogUniform()), phase=lj.Rayleigh())], lj.OrenNayar(0.5, 0.3)),
         lj.Stack([lj.TurbidMedium(0.2, LAW, 0.5, lj.HenyeyGreenstein(0.3))]),
     ):
-        assert_same(stack_from_dict(stack_to_dict(stack)), stack)
+        assert_same(stack_from_dict(material_to_dict(stack)), stack)
     stack = jax.tree.map(lambda leaf: leaf.astype("float32"), lj.Stack([], base=lj.Lambertian(albedo=np.float32(0.9))))
-    assert stack_to_dict(stack) == {"base": {"kind": "Lambertian", "albedo": 0.9}}
+    assert material_to_dict(stack) == {"base": {"kind": "Lambertian", "albedo": 0.9}}
 
 
 FREE = LAYER + "thickness = {{ start = 1, low = 0, high = 2{} }}\n"
