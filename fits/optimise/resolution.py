@@ -145,12 +145,6 @@ def resolutions(problem: Problem) -> Resolutions | None:
     return Resolutions(given, chosen(model.build(start).stack, given), tilted)
 
 
-def at_start(problem: Problem) -> Problem:
-    """The problem with the resolution that its start values ask for, if none is given."""
-    known = resolutions(problem)
-    return replace(problem, transport=known.chosen) if known is not None and known.open else problem
-
-
 def error_between(
     problem: Problem, transport: lj.AddingDoubling, vector: Floats, predicted: Floats
 ) -> Callable[[lj.AddingDoubling, lj.AddingDoubling], float]:

@@ -3,7 +3,6 @@
 from dataclasses import replace
 from pathlib import Path
 
-import jax
 import numpy as np
 import pytest
 
@@ -12,7 +11,6 @@ import layerjax as lj
 from benchmarks.measuring.cones import mean_over_cones
 from benchmarks.measuring.repeats import fit_many
 from fits.problem.instrument import Instrument
-from fits.problem.model import Model
 from fits.problem.parameters import Free, LogNormal, LogUniform
 from fits.problem.problem import Problem
 from tests.helpers.models import along
@@ -74,18 +72,6 @@ def test_a_sample_that_leans_is_seen_at_other_angles(free: bool) -> None:
     np.testing.assert_allclose(found, lj.evaluate(metal(0.3), wi, wo, SINGLE), rtol=1e-9)
     assert of.names[1:] == (("instrument.tilt",) if free else ())
     assert of.units.get("instrument.tilt", "deg") == "deg"
-
-
-def test_derivatives_by_the_offset() -> None:
-    of = problem(Instrument(detector_aperture=1.0, tilt=Free(0.0, -5.0, 5.0)))
-
-    def slope(model: Model, vector: jax.Array) -> jax.Array:
-        return jax.jacfwd(model.predict)(vector)[..., 1]
-
-    for offset in (0.0, 0.4, -5.0):
-        found = np.asarray(of.call(slope, [0.3, offset]))
-        ends = [np.asarray(of.predict([0.3, offset + step])) for step in (1e-4, -1e-4)]
-        np.testing.assert_allclose(found, (ends[0] - ends[1]) / 2e-4, rtol=1e-5, atol=1e-7)
 
 
 def test_every_incidence_has_a_gain() -> None:
