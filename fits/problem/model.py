@@ -166,7 +166,7 @@ class Model(eqx.Module):
         sigma = self._noise_at(vector, predicted)
         return (self.values - predicted) / sigma if self.process is None else -self._scaled(sigma, predicted)
 
-    def after_discrepancy_at(self, vector: Array, predicted: Array) -> Array:
+    def offsets_after_discrepancy_at(self, vector: Array, predicted: Array) -> Array:
         """`standardised_at`, less the model discrepancy that the data imply."""
         if self.process is None:
             return self.standardised_at(vector, predicted)

@@ -45,7 +45,7 @@ def misfit(fit: "Fit") -> np.ndarray:
 
     With a model discrepancy these are smaller than the noise, since it follows the data: `standardised` are not.
     """
-    independent = np.asarray(fit.problem.call(Model.after_discrepancy_at, fit.vector, fit.predicted), float)
+    independent = np.asarray(fit.problem.call(Model.offsets_after_discrepancy_at, fit.vector, fit.predicted), float)
     return over_all_rows(fit, independent / _unit(fit))
 
 
