@@ -30,6 +30,7 @@ from fits.maps.texels import standard_errors
 from fits.problem.model import Transport
 from fits.problem.noise import Noise, is_assumed
 from fits.problem.parameters import is_free, with_values
+from fits.problem.problem import with_floor
 from fits.store import fingerprint, portable_repr
 from layerjax._checks import require_kind
 from layerjax.compiling import programs_kept
@@ -101,6 +102,9 @@ def _fit(
     store = resume(path, identity, measurements, options.force)
 
     # 2. the pilot: what all chunks have in common
+    if options.instrument is not None:  # the floor of a map's noise stands in one place
+        noise = with_floor(noise or Noise(), options.instrument)
+        options = replace(options, instrument=replace(options.instrument, floor=None))
     texels = pilot_texels(data, options.pilot_texels)
     problem = make_prototype(texels, data, stack, noise, transport, options)
     kept = None if store is None else store.load_group(PILOT)

@@ -1,4 +1,4 @@
-"""What stands between a BSDF and its measurements: apertures, a tilted sample, gains.
+"""What stands between a BSDF and its measurements: apertures, a tilted sample, gains, a floor.
 
 A measurement is the mean of the BSDF over the cones of source and detector, weighted by the cosines of both. How many
 pairs of directions that takes follows from how wide the cones are beside the lobes of the stack: see `apertures`.
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from fits.data.geometry import AT_NORMAL, LIGHT_AZIMUTH, Floats, polar
 from fits.data.scans import SAME_ANGLE
 from fits.problem.apertures import MOST_OF_TWO, MOST_RINGS, rays, ring_counts
+from fits.problem.noise import require_floor
 from fits.problem.parameters import Free, LogNormal, require_number_or_free
 from layerjax._checks import require_count, require_number
 from layerjax.transport.known_directions import KnownDirections, known_directions
@@ -39,6 +40,7 @@ class Instrument:
     number, `Free`, or None for 0.
     gain_sd: relative standard deviation, in [1e-4, 1], of a factor of its own that every polar angle of the
     light has, at all azimuths, beside the common scale, with a log-normal prior about 1 that they share; None: none.
+    floor: of the noise, in 1/sr: as `Noise.floor`, in whose place it stands.
     rings: of rays that stand for a cone where a lobe is narrowest, at most, in [1, 8]; n of them keep the error below a
     thousandth of the peak where the cones together are as wide as 0.64 n - 0.25 lobes at half maximum (two cones: a
     sixth less, and at most 4). None: as many as the narrowest lobe asks for that the bounds of the stack allow; for a
@@ -49,6 +51,7 @@ class Instrument:
     detector_aperture: float = 0.0
     tilt: float | Free | None = None
     gain_sd: float | None = None
+    floor: float | Free | None = None
     rings: int | None = None
 
     def __post_init__(self) -> None:
@@ -58,6 +61,7 @@ class Instrument:
             require_number_or_free("Instrument.tilt", self.tilt, -MOST_TILT, MOST_TILT)
         if self.gain_sd is not None:
             require_number("Instrument.gain_sd", self.gain_sd, *GAIN_SPREADS)
+        require_floor("Instrument.floor", self.floor)
         if self.rings is not None:
             require_count("Instrument.rings", self.rings, 1, MOST_RINGS)
 

@@ -12,7 +12,7 @@ constant, so that a least-squares solver maximises the likelihood exactly:
 import math
 from dataclasses import dataclass
 from numbers import Real
-from typing import Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import jax.numpy as jnp
 import numpy as np
@@ -64,8 +64,7 @@ class Noise:
     def __post_init__(self) -> None:
         if self.relative is not None:
             require_number_or_free("Noise.relative", self.relative, 0.0, 1.0)
-        if self.floor is not None and not (isinstance(self.floor, Real) and self.floor == 0.0):
-            require_number_or_free("Noise.floor", self.floor, *LEVELS)
+        require_floor("Noise.floor", self.floor)
         require_switch("Noise.use_sigma", self.use_sigma)
         require_choice("Noise.tails", self.tails, get_args(Tails))
         require_number("Noise.degrees_of_freedom", self.degrees_of_freedom, *DEGREES_OF_FREEDOM)
@@ -77,6 +76,12 @@ class Noise:
             )
         if self.discrepancy and self.tails != "gaussian":
             raise ValueError(f"Noise.tails is {self.tails!r}; with model discrepancy it must be gaussian")
+
+
+def require_floor(name: str, floor: Any) -> None:
+    """ValueError for what is no floor: None, 0, or what has a square that neither vanishes nor overflows."""
+    if floor is not None and not (isinstance(floor, Real) and floor == 0.0):
+        require_number_or_free(name, floor, *LEVELS)
 
 
 def total_sigma(predicted: Array, variance: Array, relative: Array, floor: Array) -> Array:

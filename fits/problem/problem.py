@@ -226,8 +226,8 @@ class Problem(FittingProblem):
 
     @property
     def noise_is_assumed(self) -> bool:
-        """Whether neither the data nor `noise` say how large the noise is: see `Noise`."""
-        return is_assumed(self.noise, self.data)
+        """Whether neither the data nor `noise` nor the instrument say how large the noise is: see `Noise`."""
+        return is_assumed(with_floor(self.noise, self.instrument), self.data)
 
     @property
     def problems(self) -> "dict[str, Problem]":
@@ -359,7 +359,7 @@ def _assemble(problem: Problem) -> Assembled:
         raise ValueError("data: no sample is used; at least one must be")
 
     # 2. all that a parameter may stand for, in the order of `Parts`
-    levels = noise_levels(noise, used)
+    levels = noise_levels(with_floor(noise, problem.instrument), used)
     process = correlation = setting = None
     if isinstance(noise.discrepancy, Discrepancy):
         process = make_process(used.wi, used.wo, used.values.shape[1])
@@ -473,6 +473,15 @@ def _directions(problem: Problem, wi: Floats, wo: Floats, other_rays: bool = Fal
         "optics": optics,
         "side": "reflection" if np.all(wi[:, 2] > 0) and np.all(wo[:, 2] > 0) else "all",
     }
+
+
+def with_floor(noise: Noise, instrument: Instrument | None) -> Noise:
+    """The noise with an instrument's floor."""
+    if instrument is None or instrument.floor is None:
+        return noise
+    if noise.floor is not None:
+        raise ValueError("Noise.floor and Instrument.floor are both given; there is one floor")
+    return replace(noise, floor=instrument.floor)
 
 
 def polar_angles(data: Measurements) -> Floats:

@@ -22,7 +22,7 @@
                                                # discrepancy: true, or a table of its amplitude and lengths
     [scale]                                    # optional common calibration factor: start, low, high, prior
 
-    [instrument]                               # optional: apertures, tilt, gain_sd, rings: see `Instrument`
+    [instrument]                               # optional: apertures, tilt, gain_sd, floor, rings: see `Instrument`
 
     [options]                                  # optional: thresholds of the fit, see `fits.FitOptions`
 

@@ -82,7 +82,7 @@ def test_every_texel_ends_where_scipy_does_and_others_are_flagged(partial, geome
     [
         {"noise": None},
         {"noise": None, "objective": "cosine_l2"},
-        {"noise": replace(NOISE, floor=1e-4), "instrument": fits.Instrument(detector_aperture=2.0, gain_sd=0.01)},
+        {"noise": NOISE, "instrument": fits.Instrument(detector_aperture=2.0, floor=1e-4, gain_sd=0.01)},
     ],
     ids=["assumed noise", "named objective", "instrument"],
 )

@@ -106,7 +106,7 @@ def test_numbers_are_recovered_by_the_model_of_the_instrument() -> None:
 
 
 def test_instruments_are_kept_with_a_fit(tmp_path: Path) -> None:
-    given = Instrument(0.5, 1.0, Free(0.0, -2.0, 2.0), 0.03)
+    given = Instrument(0.5, 1.0, Free(0.0, -2.0, 2.0), 0.03, 1e-3)
     data = fits.simulate(metal(0.3), GEOMETRY, SINGLE, 0.02)
     stack = metal(Free(0.2, 0.05, 1.0))
     found = fits.fit(stack, data, transport=SINGLE, starts=1, instrument=given)
@@ -124,12 +124,21 @@ def test_instruments_are_kept_with_a_fit(tmp_path: Path) -> None:
         ({"tilt": Free(0.0, -20.0, 5.0)}, r"Instrument.tilt.low is -20.0; it must be a number in \[-10, 10\]"),
         ({"gain_sd": 0.0}, r"Instrument.gain_sd is 0.0; it must be a number in \[0.0001, 1\]"),
         ({"gain_sd": True}, "Instrument.gain_sd is True"),
+        ({"floor": 1e-200}, r"Instrument.floor is 1e-200; it must be a number in \[1e-100, 1e\+100\]"),
         ({"rings": 1.5}, "Instrument.rings: 1.5 is not a whole number from 1 to 8"),
     ],
 )
 def test_bad_instruments_are_refused(given: dict, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         Instrument(**given)
+
+
+def test_there_is_one_floor() -> None:
+    data = along(GEOMETRY)
+    model = Problem(metal(Free(0.2, 0.02, 1.0)), data, SINGLE, fits.Noise(0.0), instrument=Instrument(floor=1e-3)).model
+    np.testing.assert_allclose(model.sigma_at(np.array([0.2]), data.values), 1e-3)
+    with pytest.raises(ValueError, match=r"Noise.floor and Instrument.floor are both given"):
+        problem(Instrument(floor=1e-3))
 
 
 # ---- apertures as wide as a lobe ----
