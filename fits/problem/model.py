@@ -115,6 +115,10 @@ class Model(eqx.Module):
         """Half the sum of squared residuals."""
         return 0.5 * jnp.sum(jnp.stack([jnp.sum(part**2) for part in self.residuals_at(vector, predicted)]))
 
+    def log_likelihood_per_datum(self, vector: Array) -> Array:
+        """`log_likelihood_per_datum_at` what these parameters predict."""
+        return self.log_likelihood_per_datum_at(vector, self.predict(vector))
+
     def log_likelihood(self, vector: Array) -> Array:
         """Normalised log-likelihood of all data."""
         return self.log_likelihood_at(vector, self.predict(vector))
@@ -324,7 +328,8 @@ class JointModel(eqx.Module):
     varying: bool = eqx.field(static=True)
 
     residuals, cost_at, log_prior = Model.residuals, Model.cost_at, Model.log_prior
-    log_likelihood, log_posterior_unconstrained = Model.log_likelihood, Model.log_posterior_unconstrained
+    log_likelihood, log_likelihood_per_datum = Model.log_likelihood, Model.log_likelihood_per_datum
+    log_posterior_unconstrained = Model.log_posterior_unconstrained
 
     @property
     def objective(self) -> Objective:

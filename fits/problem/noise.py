@@ -12,7 +12,7 @@ constant, so that a least-squares solver maximises the likelihood exactly:
 import math
 from dataclasses import dataclass
 from numbers import Real
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple, cast, get_args
 
 import jax.numpy as jnp
 import numpy as np
@@ -21,7 +21,7 @@ from jax.scipy.special import gammaln
 
 from fits._files import require_switch
 from fits.data.geometry import Floats
-from fits.data.measurements import Measurements
+from fits.data.measurements import LARGEST, Measurements
 from fits.names import Objective
 from fits.problem.discrepancy import Discrepancy, Process, size, softness
 from fits.problem.parameters import Free, is_free, require_number_or_free
@@ -190,3 +190,14 @@ def noise_levels(noise: Noise, used: Measurements) -> Levels:
         alone = not is_free(relative) and relative == 0
         floor = 0.0 if alone else DEFAULT_FLOOR * float(np.median(np.abs(used.values)))
     return Levels(np.zeros(1) if sigma is None else np.square(sigma), relative, floor)
+
+
+def require_size(levels: Levels) -> None:
+    """ValueError for values of which a share, the floor by default, has a square that vanishes or overflows."""
+    precision, median = jnp.finfo(jnp.result_type(float)), cast(float, levels.floor) / DEFAULT_FLOOR
+    least, most = max(LEVELS[0], math.sqrt(precision.tiny)) / DEFAULT_FLOOR, min(LARGEST, math.sqrt(precision.max))
+    if levels.floor and not least <= median <= most:
+        raise ValueError(
+            f"values: the median of |value| is {median:.3g} 1/sr; for noise relative to them it must be in "
+            f"[{least:.2g}, {most:.2g}], or Noise.floor be given"
+        )

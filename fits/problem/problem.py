@@ -32,7 +32,7 @@ from fits.problem.discrepancy import Discrepancy, Process, make_process, numbers
 from fits.problem.hemispherical import Totalling
 from fits.problem.instrument import Instrument, optics_of, setting_of
 from fits.problem.model import JointModel, Model, Transport
-from fits.problem.noise import Levels, Noise, is_assumed, noise_levels
+from fits.problem.noise import Levels, Noise, is_assumed, noise_levels, require_size
 from fits.problem.parameters import Box, Free, LogNormal, Normal, is_free, names_of, require_in_range, split
 from layerjax._checks import in_short, require_choice, require_kind, require_number
 from layerjax._parameters import plain_name
@@ -155,9 +155,17 @@ class FittingProblem(abc.ABC):
         """Normalised log-likelihood of the used samples with the physical vector (P,)."""
         return self.call(Model.log_likelihood, vector)
 
+    def log_likelihood_per_datum(self, vector: ArrayLike) -> Array:
+        """Normalised log-density of each datum with the physical vector (P,), (N, C)."""
+        return self.call(Model.log_likelihood_per_datum, vector)
+
     def log_prior(self, vector: ArrayLike) -> Array:
         """Log-density of the physical vector, -inf outside the bounds."""
         return self.call(Model.log_prior, vector)
+
+    def log_posterior_unconstrained(self, u: ArrayLike) -> Array:
+        """Log-posterior over the unconstrained vector (P,), -inf where undefined."""
+        return self.call(Model.log_posterior_unconstrained, u)
 
     def call(self, function: Callable[..., Any], *arguments: Any) -> Any:
         """`function(model, *arguments)`, compiled once for all of this structure; of a method of `Model` the model's
@@ -354,12 +362,14 @@ def _assemble(problem: Problem) -> Assembled:
     """What follows from a problem; ValueError for parts that do not fit together."""
     # 1. each part is of its kind
     _require_kinds(problem)
-    used, noise = problem.data.used(), problem.noise
+    used, noise = problem.data.used(), with_floor(problem.noise, problem.instrument)
     if not used.values.size:
         raise ValueError("data: no sample is used; at least one must be")
 
     # 2. all that a parameter may stand for, in the order of `Parts`
-    levels = noise_levels(with_floor(noise, problem.instrument), used)
+    levels = noise_levels(noise, used)
+    if problem.objective == "likelihood" and noise.floor is None:
+        require_size(levels)
     process = correlation = setting = None
     if isinstance(noise.discrepancy, Discrepancy):
         process = make_process(used.wi, used.wo, used.values.shape[1])

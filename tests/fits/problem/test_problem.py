@@ -1,6 +1,6 @@
 """Problems as they are put together: the likelihood against scipy.stats, its least-squares form, what is refused."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 
 import equinox as eqx
@@ -11,7 +11,6 @@ import pytest
 from scipy import integrate, stats
 
 import layerjax as lj
-from fits.problem.model import Model
 from fits.problem.noise import (
     Noise,
     information_weights,
@@ -91,9 +90,7 @@ def test_problem_against_a_likelihood_written_out(name: str) -> None:
         sigma = np.sqrt((SIGMA**2 if noise.use_sigma else 0.0) + (relative * predicted) ** 2 + floor**2)
         law = stats.norm if noise.tails == "gaussian" else stats.t(3.0)
         each = law.logpdf((VALUES - predicted) / sigma) - np.log(sigma)
-        np.testing.assert_allclose(
-            problem.call(Model.log_likelihood_per_datum_at, vector, problem.predict(vector)), each, rtol=1e-10
-        )
+        np.testing.assert_allclose(problem.log_likelihood_per_datum(vector), each, rtol=1e-10)
         assert float(problem.log_likelihood(vector)) == pytest.approx(each.sum(), rel=1e-12)
         priors = stats.norm.logpdf(named["['b']"], 0.3, 0.5) + stats.norm.logpdf(np.log(named["scale"]), 0, 0.1)
         half = 0.5 * float(np.sum(np.square(problem.residuals(vector))))
@@ -109,9 +106,9 @@ def test_posterior_density_is_likelihood_prior_and_map() -> None:
     slopes = np.array([0.5 * np.log(200.0), 2.0]) * share * (1 - share)
     expected = float(problem.log_likelihood(vector)) + prior + np.sum(np.log(slopes))
     u = np.log(share) - np.log1p(-share)
-    assert float(problem.call(Model.log_posterior_unconstrained, u)) == pytest.approx(expected, rel=1e-12)
+    assert float(problem.log_posterior_unconstrained(u)) == pytest.approx(expected, rel=1e-12)
     for far in (np.array([np.nan, 0.0]), np.array([np.inf, 0.0])):
-        assert float(problem.call(Model.log_posterior_unconstrained, far)) == -np.inf
+        assert float(problem.log_posterior_unconstrained(far)) == -np.inf
 
 
 def test_masked_samples_never_enter_and_noise_is_five_per_cent_by_default() -> None:
@@ -145,6 +142,14 @@ def lambert(stack: lj.Stack, wi: jax.Array, wo: jax.Array, gain: float = 1.0) ->
     return jnp.broadcast_to(gain * stack.base.albedo / jnp.pi, (len(wi), 1))
 
 
+@dataclass(frozen=True)
+class Plain:
+    gain: float
+
+    def __call__(self, stack: lj.Stack, wi: jax.Array, wo: jax.Array) -> jax.Array:
+        return lambert(stack, wi, wo, self.gain)
+
+
 class Module(eqx.Module):
     gain: jax.Array
 
@@ -156,6 +161,8 @@ CALLABLES = {
     "lambda": (lambda stack, wi, wo: lambert(stack, wi, wo, 2.0), 2.0),
     "compiled": (jax.jit(lambert), 1.0),
     "partial": (partial(lambert, gain=0.5), 0.5),
+    "bound method": (Plain(3.0).__call__, 3.0),
+    "object": (Plain(3.0), 3.0),
     "equinox module": (Module(jnp.asarray(0.25)), 0.25),
 }
 
@@ -191,10 +198,18 @@ LINE_DATA = measured(VALUES)
     [
         (lambda: Noise(relative=-0.1), "Noise.relative is -0.1"),
         (lambda: Noise(floor=Free(0.1, 0.0, 1.0)), r"Noise.floor.low is 0.0; it must be a number in \[1e-100, "),
+        (lambda: Noise(relative=Free([0.1, 0.1], 0.0, 1.0)), "Noise.relative has 2 channels"),
+        (lambda: Noise(floor=1e-200), r"Noise.floor is 1e-200; it must be a number in \[1e-100, 1e\+100\]"),
+        (lambda: Noise(relative=Free(0.5, 0.0, 5.0)), r"Noise.relative.high is 5.0; it must be a number in \[0, 1\]"),
+        (lambda: Noise(degrees_of_freedom=0.0), "Noise.degrees_of_freedom is 0.0"),
         (lambda: Noise(tails="cauchy"), "Noise.tails: 'cauchy' is not one of 'gaussian', 'student'"),
         (lambda: Problem({"a": 0.1, "b": 0.2}, LINE_DATA, line), "nothing is free"),
         (lambda: Problem(STACK, measured(VALUES, mask=np.zeros(COUNT, bool)), line), "no sample is used"),
         (lambda: Problem(STACK, LINE_DATA, line, Noise(relative=0.0, floor=0.0)), "sigma could become 0"),
+        (
+            lambda: Problem(STACK, measured(1e-300 * np.ones_like(VALUES)), line),
+            r"^values: the median of \|value\| is 1e-300 1/sr; .* must be in \[1e-96, 1e\+30\], or Noise.floor",
+        ),
         (lambda: Problem(STACK, LINE_DATA, line, objective="l1"), "objective: 'l1' is not one of 'likelihood', "),
         (lambda: Problem(STACK, LINE_DATA, line, scale=-1.0), "scale is -1.0"),
         (

@@ -154,7 +154,8 @@ WRONG = {
     BASE + "noise = { discrepancy = { length_half = -3.0 } }\n": "noise.discrepancy.length_half is -3.0",
     BASE + "scale = { start = [1, 1], low = 0.5, high = 2 }\n": "scale has 2 channels, must be one number for all",
     BASE + "instrument = { detector_aperture = 31 }\n": r"instrument.detector_aperture is 31; .* in \[0, 30\]",
-    BASE + "instrument = { floor = { start = 1, low = 0, high = 2 } }\n": "instrument.floor.low is 0; .* in .1e-100, ",
+    BASE
+    + "instrument = { floor = { start = 1, low = 0, high = 2 } }\n": "instrument.floor.low is 0.0; .* in .1e-100, ",
     BASE + "transport = 'Singlescattering'\n": "transport is 'Singlescattering' .did you mean 'SingleScattering'",
     "[base]\nkind = 'Lambertian'\nalbedo = [0.1, 0.2]\n"
     + LAYER
