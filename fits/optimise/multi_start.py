@@ -217,8 +217,8 @@ def polish(
 ) -> Optimum:
     """The lowest of the ends, followed to its very minimum, and checked by L-BFGS-B where it has not converged.
 
-    check: also where a parameter lies on a bound. It takes a hundred steps: what begins at a minimum that was checked
-    goes without. tolerance: how far it is followed, see `descend`.
+    check: also where a parameter lies on a bound or has no influence. It takes a hundred steps: what begins at a
+    minimum that was checked goes without. tolerance: how far it is followed, see `descend`.
     """
     best, improved = int(np.argmin([end.cost for end in ends])), False
     lowest, likelihood = ends[best], problem.objective == "likelihood"
@@ -228,16 +228,25 @@ def polish(
         if closer.cost <= lowest.cost:
             lowest = closer._replace(steps=lowest.steps + closer.steps)
     found = uncertainty(problem, lowest.vector, lowest.cost)
-    # 2. checked by L-BFGS-B
+    # 2. no step leads off a plateau, where every start may end though another minimum is far lower: insensitive
+    # parameters and those at a bound begin anew
+    if check and found.insensitive:
+        stuck = np.isin(problem.names, found.insensitive) | found.at_bound
+        point = np.where(stuck, unit_of(problem, problem.start), unit_of(problem, lowest.vector))
+        other = least_squares_descent(problem, point, tolerance=tolerance)
+        if other.cost < lowest.cost - (ROUGH_TOLERANCE if likelihood else LEAST_RELATIVE_GAIN * lowest.cost):
+            lowest = other._replace(steps=lowest.steps + other.steps)
+            found = uncertainty(problem, lowest.vector, lowest.cost)
+    # 3. checked by L-BFGS-B
     if (check and found.at_bound.any()) or not lowest.converged:
         lowest, improved = lbfgsb_polish(problem, lowest)
         found = uncertainty(problem, lowest.vector, lowest.cost) if improved else found
-    # 3. exactly on the bounds that hold it
+    # 4. exactly on the bounds that hold it
     low, high, held, vector = problem.low, problem.high, found.at_bound, lowest.vector
     nearest = np.where(vector - low < high - vector, low, high)
     lowest = lowest._replace(vector=np.where(held, nearest, np.clip(vector, low, high)))
     predicted = evaluate_at(problem, unit_of(problem, lowest.vector)).predicted if held.any() else found.predicted
-    # 4. the reduced chi-square where it is above 1; of a named objective, the residual variance
+    # 5. the reduced chi-square where it is above 1; of a named objective, the residual variance
     freedom = max(problem.count - len(lowest.vector), 1)
     if likelihood:
         excess = max(1.0, float(problem.call(Model.chi_square_at, lowest.vector, predicted)) / freedom)

@@ -2,14 +2,21 @@
 
 from dataclasses import replace
 
+import numpy as np
+import pytest
+
 import layerjax as lj
+from fits.data.geometry import slices
 from fits.data.reading import read
 from fits.optimise import multi_start as starts_module
 from fits.optimise.fit import fit
-from fits.optimise.multi_start import LEAST_GAIN, multi_start, start_points, starts_store
+from fits.optimise.levenberg_marquardt import evaluate_at
+from fits.optimise.multi_start import LEAST_GAIN, multi_start, start_points, starts_store, unit_of
 from fits.optimise.result import OUTCOMES
 from fits.problem.noise import Noise
+from fits.problem.parameters import Free, LogUniform
 from fits.problem.problem import Problem
+from fits.problem.simulate import simulate
 from fits.problem.stack_file import read_problem
 from tests.helpers.models import LINE, LOBE, LOBE_STACK, directions, line, line_data, lobe, measured
 from tests.helpers.places import EXAMPLES
@@ -17,6 +24,27 @@ from tests.helpers.places import EXAMPLES
 COATINGS = EXAMPLES / "arizona_black_coatings"
 
 STEEL = "nite_on_blasted_steel1008_650nm_inplane.csv"
+
+
+def cost_at(problem, values):
+    """Of the stack with these values, and everything else at the end of its range that is nearest to nothing."""
+    vector = np.array([values.get(name, low) for name, low in zip(problem.names, problem.low, strict=True)])
+    return float(evaluate_at(problem, unit_of(problem, vector)).cost)
+
+
+@pytest.mark.slow
+def test_a_stack_never_ends_above_what_it_contains():
+    """A haze over flakes on paint: the flakes on paint, beside steel."""
+    data, ends = read(COATINGS / STEEL).select(incidence=(10.0, 50.0)), {}
+    for name in ("hazy_coat_over_diffuse", "flake_coat_over_diffuse"):
+        given = read_problem(EXAMPLES / f"{name}.toml")
+        # the cheapest transport: what is asked is about starts, whatever carries the light
+        options = {"transport": lj.SingleScattering(), "noise": given.noise, "scale": given.scale}
+        ends[name] = fit(given.stack, data, starts=8, **options)
+    whole, part = ends.values()
+    values = {name.replace("layers[0]", "layers[1]"): value for name, value in part.values.items()}
+    # to what a start that goes on is worth
+    assert whole.minima[0].cost <= cost_at(whole.problem, values) + LEAST_GAIN
 
 
 def test_a_race_ends_where_all_starts_do(monkeypatch):
@@ -88,3 +116,18 @@ def test_starts_are_those_of_the_same_fit_only(tmp_path):
         {"transport": lambda stack, wi, wo: 2.0 * line(stack, wi, wo)},
     ]
     assert [kept(**other) for other in others] == [0] * len(others)
+
+
+@pytest.mark.slow
+def test_a_fit_does_not_end_on_a_plateau():
+    """Of backward scattering `Statistical` knows nothing: the only start comes to rest where g is below 0."""
+    noise = Noise(relative=0.02, floor=1e-6, discrepancy=False)
+    haze, metal = lj.Medium(0.84, 1.0, lj.HenyeyGreenstein(0.13)), lj.Conductor(0.4, 3.2, 0.37)
+    data = simulate(lj.Stack([haze], metal), slices([10.0, 30.0, 50.0, 70.0]), lj.Statistical(), 0.02, 1e-6, seed=1)
+    thickness, index = Free(0.1, 1e-3, 5.0, LogUniform()), Free(1.5, 0.05, 9.0, LogUniform())
+    haze = lj.Medium(thickness, 1.0, lj.HenyeyGreenstein(Free(0.3, -0.6, 0.9)))
+    metal = lj.Conductor(index, Free(0.5, 0.01, 9.0, LogUniform()), Free(0.3, 0.02, 1.0))
+    found = fit(lj.Stack([haze], metal), data, transport=lj.Statistical(), noise=noise, starts=1)
+    truth = {"layers[0].thickness": 0.84, "layers[0].phase.g": 0.13, "base.ior": 0.4, "base.k": 3.2, "base.alpha": 0.37}
+    assert found.minima[0].cost <= cost_at(found.problem, truth)
+    assert not found.insensitive
