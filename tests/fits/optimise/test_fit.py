@@ -8,7 +8,7 @@ from scipy.optimize import least_squares
 
 import layerjax as lj
 from fits.data.geometry import slices
-from fits.optimise.fit import fit
+from fits.optimise.fit import fit, start_points
 from fits.optimise.levenberg_marquardt import COST_TOLERANCE
 from fits.optimise.options import FitOptions, options_from
 from fits.optimise.uncertainty import Direction
@@ -69,6 +69,28 @@ def test_the_lobe_fit_is_scipys(lobe_fit):
     other = fit(LOBE_STACK, noisy_lobe(1), transport=lobe, starts=2, seed=3)
     assert _program(True)._cache_size() == before
     assert other.values != lobe_fit.values
+
+
+def test_the_gradient_of_the_posterior_agrees_with_differences():
+    def value_and_gradient(model, u):
+        return jax.value_and_grad(model.log_posterior_unconstrained)(u)
+
+    problem = Problem(LOBE_STACK, noisy_lobe(0), lobe)
+    u = np.linspace(-1.0, 1.0, 6)
+    # the error of central differences is about h^2 = 1e-8 relative, their rounding 1e-16 / h of the log-posterior
+    gradient, h = problem.call(value_and_gradient, u)[1], 1e-4
+    for index, step in enumerate(np.eye(6) * h):
+        up, down = (float(problem.call(value_and_gradient, u + sign * step)[0]) for sign in (1.0, -1.0))
+        np.testing.assert_allclose(gradient[index], (up - down) / (2.0 * h), rtol=1e-6)
+
+
+def test_starts_are_seeded_and_fill_the_box():
+    problem = Problem(LOBE_STACK, noisy_lobe(0), lobe)
+    points = start_points(problem, 33, 5)
+    np.testing.assert_array_equal(points, start_points(problem, 33, 5))
+    np.testing.assert_allclose(problem.model.box.from_unit(jnp.asarray(points[0])), problem.start)
+    assert np.all(np.abs(points[1:].mean(axis=0) - 0.5) < 0.03)  # random points: 0.05 standard deviations
+    assert not np.array_equal(points[1:], start_points(problem, 33, 6)[1:])
 
 
 def test_a_parameter_beyond_its_bound_is_held_there_and_one_near_it_is_not():
@@ -182,6 +204,14 @@ def test_free_noise_levels_are_recovered(tails):
     assert result.units["noise.floor"] == "1/sr"
 
 
+def test_student_tails_shrug_off_outliers():
+    spoiled = noisy_line().values.copy()
+    spoiled[::20] += 3.0
+    for tails in ("student", "gaussian"):
+        found = fit(LINE, measured(spoiled, 0.05), transport=line, noise=Noise(tails=tails), starts=4)
+        assert (abs(found.values[A] - 1.0) < 4 * found.standard_errors[A]) == (tails == "student")
+
+
 def test_a_scale_with_its_prior():
     """Only scale times (a, b) is known; the prior on the logarithm decides the scale, and gives its error."""
     scale = Free(1.0, 0.5, 2.0, LogNormal(1.1, 0.05))
@@ -219,6 +249,22 @@ def test_starts_that_fail_are_counted_and_not_believed():
 
 
 # ---- stacks of layerjax, and arguments ----
+
+
+def test_a_medium_over_a_base_is_recovered():
+    """In two channels, from simulated slices."""
+
+    def stack(thickness, albedo, g, base):
+        return lj.Stack([lj.Medium(thickness, albedo, lj.HenyeyGreenstein(g))], lj.Lambertian(base))
+
+    free = stack(Free(1.0, 0.05, 5.0), Free([0.5, 0.5], 0.0, 1.0), Free(0.0, -0.9, 0.9), Free(0.5, 0.0, 1.0))
+    view, single, calls = slices(incidence=[10, 40, 60], azimuth=[0, 90]), lj.SingleScattering(), []
+    data = simulate(stack(0.6, [0.9, 0.6], 0.3, 0.4), view, transport=single, noise=0.02, seed=3)
+    result = fit(free, data, transport=single, starts=3, progress=lambda *call: calls.append(call))
+    assert result.converged
+    assert np.all(np.abs(result.vector - [0.6, 0.9, 0.6, 0.3, 0.4]) < 4 * result.errors)
+    assert float(result.stack.base.albedo) == result.values["base.albedo"]
+    assert [call[:3] for call in calls] == [("fit", done, 3) for done in (1, 2, 3)]
 
 
 def test_what_is_known_of_the_stack_stays_known_in_a_fit():

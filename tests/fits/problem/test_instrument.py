@@ -3,6 +3,7 @@
 from dataclasses import replace
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 
@@ -10,7 +11,9 @@ import fits
 import layerjax as lj
 from benchmarks.measuring.cones import mean_over_cones
 from benchmarks.measuring.repeats import fit_many
+from fits.data.geometry import direction
 from fits.problem.instrument import Instrument
+from fits.problem.model import Model
 from fits.problem.parameters import Free, LogNormal, LogUniform
 from fits.problem.problem import Problem
 from tests.helpers.models import along
@@ -74,6 +77,28 @@ def test_a_sample_that_leans_is_seen_at_other_angles(free: bool) -> None:
     assert of.units.get("instrument.tilt", "deg") == "deg"
 
 
+def test_leaning_out_of_the_plane_keeps_angles_between() -> None:
+    geometry = fits.slices([0.0, 30.0], [20.0, 50.0], [0.0, 60.0])
+    optics = problem(Instrument(tilt=4.0), geometry=geometry).model.optics
+    wi, wo = np.asarray(optics.wi), np.asarray(optics.wo)
+    np.testing.assert_allclose(np.sum(wi * wo, axis=-1), np.sum(geometry.wi * geometry.wo, axis=-1), atol=1e-12)
+    np.testing.assert_allclose(np.linalg.norm(wo, axis=-1), 1.0, atol=1e-12)
+    expected = np.degrees(np.arccos(geometry.wi[:, 2])) + 4.0
+    np.testing.assert_allclose(np.degrees(np.arccos(wi[:, 2])), expected, atol=1e-9)
+
+
+def test_derivatives_by_the_offset() -> None:
+    of = problem(Instrument(detector_aperture=1.0, tilt=Free(0.0, -5.0, 5.0)))
+
+    def slope(model: Model, vector: jax.Array) -> jax.Array:
+        return jax.jacfwd(model.predict)(vector)[..., 1]
+
+    for offset in (0.0, 0.4, -5.0):
+        found = np.asarray(of.call(slope, [0.3, offset]))
+        ends = [np.asarray(of.predict([0.3, offset + step])) for step in (1e-4, -1e-4)]
+        np.testing.assert_allclose(found, (ends[0] - ends[1]) / 2e-4, rtol=1e-5, atol=1e-7)
+
+
 def test_every_incidence_has_a_gain() -> None:
     of = problem(Instrument(gain_sd=0.03))
     assert of.names == ("base.alpha", "instrument.gains[0]", "instrument.gains[1]", "instrument.gains[2]")
@@ -84,6 +109,15 @@ def test_every_incidence_has_a_gain() -> None:
     # LogNormal(1, 0.03): the density of a gain of 1.05 is lower by (log 1.05 / 0.03)^2 / 2 + log 1.05
     gap = float(of.log_prior([0.3, 1.0, 1.0, 1.0]) - of.log_prior([0.3, 1.0, 1.0, 1.05]))
     assert gap == pytest.approx(0.5 * (np.log(1.05) / 0.03) ** 2 + np.log(1.05))
+
+
+def test_light_at_one_polar_angle_has_one_gain() -> None:
+    """From all azimuths, and where angles were measured, a hundredth of a degree apart."""
+    given = fits.slices([10.0, 40.0], np.arange(-60.0, 61.0, 20.0))
+    theta, phi = np.degrees(np.arccos(given.wi[:, 2])), np.tile([0.0, 90.0, 180.0], len(given))[: len(given)]
+    wi = direction(theta + 0.05 * np.sin(7.0 * np.arange(len(given))), phi)
+    optics = problem(Instrument(gain_sd=0.03), geometry=fits.Geometry(wi, given.wo)).model.optics
+    np.testing.assert_array_equal(optics.incidence, theta > 25.0)
 
 
 def test_numbers_are_recovered_by_the_model_of_the_instrument() -> None:
