@@ -46,7 +46,7 @@ from fits.optimise.result import OUTCOMES, Fit, Minimum, WithoutDiscrepancy
 from fits.optimise.uncertainty import UNCONSTRAINED_BEYOND
 from fits.problem.instrument import Instrument
 from fits.problem.model import Transport
-from fits.problem.noise import Noise
+from fits.problem.noise import DEFAULT_RELATIVE, Noise
 from fits.problem.parameters import Free
 from fits.problem.problem import FittingProblem, Problem
 from fits.progress import Progress, given_progress, silent
@@ -274,6 +274,11 @@ def _result(at: Optimum, accuracy: Accuracy | None, run: _Run, without: Mapping[
     if alternatives:
         words = f"{len(alternatives)} more local minima fit equally well"
         status.append(f"errors are conditional on this local minimum; {words}")
+    if problem.objective != "likelihood":
+        words = "the errors are scaled by its scatter, no posterior"
+        status.append(f"objective {problem.objective} is no likelihood: {words}")
+    elif any(one.noise_is_assumed for one in problem.problems.values()):
+        status.append(f"a noise of {100.0 * DEFAULT_RELATIVE:g} % of the model's value was assumed, none is stated")
     status += ["L-BFGS-B improved on Levenberg-Marquardt"] if at.improved else []
     status += [] if accuracy is None else [accuracy.words]
     result = Fit(

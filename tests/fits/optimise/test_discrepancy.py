@@ -81,6 +81,8 @@ def test_a_right_one_is_not():
     assert found.without_discrepancy is None
     assert not found.problem.noise.discrepancy
     assert list(found.values) == ["['a']", "['b']"]
+    assert "assumed" not in found.status
+    assert "a noise of 5 % of the model's value was assumed" in fitted(0.0, Noise(discrepancy=False)).status
 
 
 @pytest.mark.parametrize(
