@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 import layerjax as lj
 from fits._files import given_path, locked
+from fits.data.geometry import direction
 from fits.engines import Failure, connected, end_repeated_script, run
 from fits.maps.inputs import Block, MapData, Measured, block_words, map_data
 from fits.maps.options import DEFAULT, VERDICTS, MapOptions
@@ -27,7 +28,7 @@ from fits.maps.store import FLAGS, FittedMap, Store, arrays_of, blocks_of, creat
 from fits.maps.texels import standard_errors
 from fits.problem.model import Transport
 from fits.problem.noise import Noise, is_assumed
-from fits.problem.parameters import is_free
+from fits.problem.parameters import is_free, with_values
 from fits.problem.problem import with_floor
 from fits.store import fingerprint, portable_repr
 from layerjax._checks import require_kind
@@ -95,7 +96,7 @@ def _fit(
     path: Path, data: MapData, stack: Any, noise: Noise | None, transport: Any, options: MapOptions, client: Any
 ) -> FittedMap:
     # 1. whose map it is
-    identity = _identity(stack, noise, transport, options) | {"measurements": data.fingerprint()}
+    identity = _identity(stack, noise, transport, data.samples, options) | {"measurements": data.fingerprint()}
     store = resume(path, identity, options.force)
 
     # 2. the pilot: what all chunks have in common
@@ -135,8 +136,8 @@ def _fit(
     return open_map(path)
 
 
-def _identity(stack: Any, noise: Noise | None, transport: Any, options: MapOptions) -> dict[str, str]:
-    """Fingerprints of what makes a fit, by name; of a transport that is a function, by its name."""
+def _identity(stack: Any, noise: Noise | None, transport: Any, samples: int, options: MapOptions) -> dict[str, str]:
+    """Fingerprints of what makes a fit, by name; of a transport that is a function, by what it predicts."""
 
     def parts_of(tree: Any) -> list[Any]:
         leaves, structure = jax.tree.flatten(tree, is_leaf=is_free)
@@ -144,8 +145,13 @@ def _identity(stack: Any, noise: Noise | None, transport: Any, options: MapOptio
 
     parts = {"stack": stack, "noise": noise, "transport": transport, **options.model}
     numbers = {name: one for name, one in options.numbers().items() if name not in VERDICTS}
-    precision = str(np.dtype(jnp.result_type(float)))
-    return fingerprint(**{name: parts_of(one) for name, one in parts.items()}, **numbers, precision=precision)
+    precision, parts = str(np.dtype(jnp.result_type(float))), {name: parts_of(one) for name, one in parts.items()}
+    if not isinstance(transport, str | lj.Transport):
+        angles = np.linspace(5.0, 75.0, samples)
+        wi, wo = direction(angles, 0.0 * angles), direction(angles[::-1], 20.0 * angles)
+        start = jax.tree.map(lambda one: jnp.asarray(one.arrays()[0]) if is_free(one) else one, stack, is_leaf=is_free)
+        parts["transport"] += [np.asarray(jax.jit(transport)(with_values(start), wi, wo), np.float32)]
+    return fingerprint(**parts, **numbers, precision=precision)
 
 
 def tile(shape: tuple[int, ...], texels: int) -> tuple[int, ...]:

@@ -30,7 +30,7 @@ from fits.store import another, differences
 
 Floats = NDArray[np.float64]
 
-KEY, KIND = "layerjax", "fitted map"
+KEY, KIND, FORMAT = "layerjax", "fitted map", 6
 PILOT, SMOOTHED = "pilot", "smoothed"
 PARTIAL = ".partial"
 """How names end, here and in zarr, of what has not been written to its end."""
@@ -99,6 +99,8 @@ class FittedMap:
     def __init__(self, path: str | Path, mode: Any = "r"):
         self.path = given_path("path", path)
         self.attributes = about = _attributes(self.path)
+        if about.get("format") != FORMAT:
+            raise ValueError(f"{path}: is version {about.get('format')} of the format, must be {FORMAT}")
         try:
             self.names, self.units = tuple(about["names"]), dict(about["units"])
             self.shape, self.chunk = tuple(about["shape"]), tuple(about["chunk"])
@@ -343,7 +345,7 @@ def create(path: Path, attributes: Mapping[str, Any], pilot: Mapping[str, np.nda
     new = _scratch(path)
     with named(path):
         try:
-            root = zarr.create_group(new, attributes={KEY: plain({**attributes, "kind": KIND})})
+            root = zarr.create_group(new, attributes={KEY: plain({**attributes, "kind": KIND, "format": FORMAT})})
             for name, (dtype, fill) in arrays_of(names).items():
                 root.create_array(
                     name,

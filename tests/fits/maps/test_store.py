@@ -129,6 +129,7 @@ def spoil_smoothed(path, *names):
         (lambda path: (path / "zarr.json").unlink(), "is no store of a fitted map"),
         (lambda path: (path / "zarr.json").write_text("{"), "is no store of a fitted map"),
         (lambda path: change_root(path, kind="x"), "it holds a x"),
+        (lambda path: change_root(path, format=1), "is version 1 of the"),
         (lambda path: change_root(path, names=None), "damaged, KeyError 'names'"),
         (lambda path: change_root(path, shape=[7, 9]), "has shape"),
         (lambda path: shutil.rmtree(path / "flags"), "damaged, .*flags"),
