@@ -482,7 +482,7 @@ def overview(rows: Sequence[Row], most: int | None = None) -> tables.Table:
         "Standing: among the stacks of a file, by -2 log predictive density of held-out data, or else AIC: as good as "
         "the best, or the difference; where the best misses the data, the scatter that it leaves counts as noise."
     )
-    return tables.Table("Fits", tuple(columns), tables.shortened(shown, most or len(shown)), note, keys=2)
+    return tables.Table("Fits", tuple(columns), tables.shortened(shown, most or len(shown)), note)
 
 
 def statements(result: FittedFiles) -> list[str]:

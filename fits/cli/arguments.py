@@ -3,7 +3,6 @@
 import argparse
 import math
 from collections.abc import Callable, Mapping
-from difflib import get_close_matches
 from types import MappingProxyType
 from typing import Any, NamedTuple, NoReturn
 
@@ -38,16 +37,10 @@ def degrees(words: str) -> list[float]:
     return [polar(word) for word in words.split(",")]
 
 
-def scale(word: str) -> tuple[str, float]:
-    """A number, at least 0, and the name before it, as in base.albedo=0.1; "" where there is none."""
-    name, _, number = word.rpartition("=")
-    return name, level(number)
-
-
 DATA = "measurements: csv, MERL .binary, .bsdf and others, see docs/formats.md"
 RESULT = "result directory of `layerjax fit`"
 MATERIAL = f"{RESULT}, a stack (free parameters at their start), or a material of the gallery"
-SELECTIONS = "incidence=10,50; plane=0; angle=-60:60; share=0.2; channel=red"
+SELECTIONS = "incidence=10,50; azimuth=0; theta_o=20:60; channels=red"
 
 Settings = dict[str, Any]
 
@@ -147,12 +140,7 @@ COMMANDS = {
                 "total_variation: areas are even, edges stay (default: none)",
                 choices=("gaussian", "total_variation"),
             ),
-            "--spatial-scale": _several(
-                "of the difference between neighbours, as a share of the bounds, of all parameters or of NAME",
-                "[NAME=]X",
-                type=scale,
-            ),
-            "--spatial-rounds": _one("of that prior, at most (default: 10)", "N", type=count, default=10),
+            "--spatial-scale": _one("of the difference between neighbours, as a share of the bounds", "X", type=level),
         },
         "--stack --noise --starts --seed --processes --scheduler --force",
         {
@@ -188,7 +176,7 @@ COMMANDS = {
         "--read --select --force",
     ),
     "report": Command(
-        "write the report and the pictures of a result directory again, or the report of a fitted map",
+        "write the report of a result directory again, or that of a fitted map",
         "layerjax report result --compare other_result",
         {
             "directory": _one(f"{RESULT}, or store of `layerjax fit-map`", "DIR"),
@@ -200,13 +188,12 @@ COMMANDS = {
     ),
     "compare": Command(
         "compare fits of the same data by out-of-sample prediction",
-        "layerjax compare coated bare --out comparison.html",
+        "layerjax compare coated bare",
         {
             "directories": _several("two or more result directories", "DIR"),
-            "--out": _out("HTML", "write the comparison with its pictures to this file", required=False),
             "--no-refit": _flag("rank by AIC, without cross-validation"),
         },
-        "--force",
+        "",
     ),
     "search": Command(
         "search for the stack behind data: stacks grow layer by layer and are ranked by out-of-sample prediction",
@@ -271,7 +258,6 @@ COMMANDS = {
         {
             "material": _one(MATERIAL, "DIR|TOML|NAME"),
             "--out": _out("PNG", "file to write; its name ends in .png"),
-            "--size": _one("pixels a sphere (default: %(default)s)", "N", type=count, default=256),
         },
         "--force",
     ),
@@ -316,15 +302,7 @@ def build_parser() -> argparse.ArgumentParser:
 
 
 class _Parser(argparse.ArgumentParser):
-    """Reports an error in one line, as every other error of the command; of flags first one that there is not."""
-
-    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
-        flags = () if self._subparsers else [word.partition("=")[0] for word in args or () if word.startswith("--")]
-        for flag in flags:
-            if not any(option.startswith(flag) for option in self._option_string_actions):
-                near = get_close_matches(flag, self._option_string_actions, 1)
-                self.error(f"unrecognized argument: {flag}{f'; is it {near[0]}?' if near else ''}")
-        return super().parse_known_args(args, namespace)
+    """Reports an error in one line, as every other error of the command."""
 
     def error(self, message: str) -> NoReturn:
         self.exit(2, f"{self.prog}: error: {message} (see {self.prog} --help)\n")

@@ -99,23 +99,19 @@ def predict(arguments: Namespace) -> int:
         raise ValueError("predict needs one of --incidence and --score")
     if not scored and out is None:
         raise ValueError("predict --incidence needs --out FILE")
-    if scored:
-        refuse_alone(arguments, ("azimuth",), "incidence")
-    else:
-        refuse_alone(arguments, ("select", "read"), "score")
+    refuse_alone(arguments, ("azimuth",) if scored else ("select", "read"), "incidence" if scored else "score")
     require_free_place(out, arguments.force, ".csv", "predictions")
     use_jax()
     from fits.prediction.predict import predict as run_prediction
     from fits.reports import tables
 
-    source, at = _result(Path(arguments.directory)), None
+    source = _result(Path(arguments.directory))
     if scored:
-        at = read_options(arguments).read(arguments.score)
-        found = run_prediction(source, at)
+        data = read_options(arguments).read(arguments.score)
+        found = run_prediction(source, data)
+        show(tables.scores_table(found, data, f"Prediction of {arguments.score}"))
     else:
         found = run_prediction(source, slices(np.concatenate(arguments.incidence), azimuth=arguments.azimuth or (0,)))
-    if at is not None:
-        show(tables.scores_table(found, at, f"Prediction of {arguments.score}"))
     if out is not None:
         write_text(out, tables.prediction_csv(found), force=arguments.force)
         show(
@@ -156,19 +152,14 @@ def compare(arguments: Namespace) -> int:
     """Print which of several saved fits predicts the data best."""
     if len(arguments.directories) < 2:
         raise ValueError(f"{arguments.directories[0]} is the only directory given, must be two or more")
-    require_free_place(arguments.out, arguments.force)
     use_jax()
     from fits.prediction.compare import compare as run_compare
     from fits.reports import tables
-    from fits.reports.html import comparison_page
 
     candidates = _candidates(arguments.directories)
     with show_progress() as progress:
         compared = run_compare(candidates, refit=not arguments.no_refit, progress=progress)
     show(tables.comparison_table(compared), *compared.verdict)
-    if arguments.out:
-        write_text(arguments.out, comparison_page(candidates, compared), force=arguments.force)
-        print(f"Comparison: {arguments.out}")
     return DONE
 
 

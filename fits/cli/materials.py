@@ -72,7 +72,7 @@ def render(arguments: Namespace) -> int:
         material.require_one("render")
         used = material.problem.transport
         material, transport = material.stack, used if isinstance(used, Transport) else None
-    figure = run_render(material, transport, title=Path(name).resolve().stem.replace("_", " "), size=arguments.size)
+    figure = run_render(material, transport, title=Path(name).resolve().stem.replace("_", " "))
     write_bytes(arguments.out, as_png(figure), force=arguments.force)
     print(f"{arguments.out}: {name}")
     return DONE

@@ -103,17 +103,15 @@ def scans(data: Pairs) -> list[np.ndarray]:
     return ordered
 
 
-def neighbours(data: Pairs, residuals: np.ndarray, lag: int = 1) -> tuple[np.ndarray, np.ndarray]:
-    """Residuals (N, C) of pairs that lie `lag` measurements apart in a scan, two arrays; rows with NaN are skipped."""
+def neighbours(data: Pairs, residuals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Residuals (N, C) of neighbours in a scan, two arrays; rows with NaN are skipped."""
     # The mean is not subtracted: a bias over a stretch of angle is structure too.
     pairs = []
     for rows in scans(data):
         scan = residuals[rows][np.isfinite(residuals[rows]).all(axis=-1)]
-        if len(scan) > lag:
-            pairs.append((scan[:-lag].ravel(), scan[lag:].ravel()))
-    if not pairs:
-        return np.empty(0), np.empty(0)
-    return np.concatenate([first for first, _ in pairs]), np.concatenate([second for _, second in pairs])
+        pairs.append((scan[:-1].ravel(), scan[1:].ravel()))
+    first, second = zip(*pairs, strict=True) if pairs else ([np.empty(0)], [np.empty(0)])
+    return np.concatenate(first), np.concatenate(second)
 
 
 def correlation(first: np.ndarray, second: np.ndarray) -> float:

@@ -8,9 +8,10 @@ import numpy as np
 from fits.data.geometry import Geometry
 from fits.data.measurements import Measurements
 from fits.optimise.result import Fit
+from fits.prediction.compare import fits_of
 from fits.prediction.cross_validation import model_scores
 from fits.prediction.options import ComparisonOptions
-from fits.prediction.predict import DRAWS, LEVELS, Prediction, predict
+from fits.prediction.predict import DRAWS, Prediction, predict
 from fits.progress import Progress
 from fits.sampling.posterior import Posterior, require_fits
 from layerjax._checks import require_kind
@@ -27,19 +28,12 @@ class Average:
     candidates: Mapping[str, Fit | Posterior]
     weights: Mapping[str, float]
 
-    def predict(
-        self,
-        at: Geometry | Measurements,
-        *,
-        levels: tuple[float, ...] = LEVELS,
-        draws: int = DRAWS,
-        seed: int = 0,
-    ) -> Prediction:
+    def predict(self, at: Geometry | Measurements, *, draws: int = DRAWS, seed: int = 0) -> Prediction:
         """See `fits.predict`; the draws are divided between the candidates in proportion to the weights."""
         # differences of rounded cumulative weights, which sum to all draws however many candidates there are
         counts = np.diff(np.round(draws * np.cumsum([0.0, *self.weights.values()])))
         parts = [
-            predict(self.candidates[name], at, levels=levels, draws=max(int(count), 2), seed=seed + number)
+            predict(self.candidates[name], at, draws=max(int(count), 2), seed=seed + number)
             for number, (name, count) in enumerate(zip(self.weights, counts, strict=True))
             if count > 0
         ]
@@ -91,8 +85,8 @@ def average(
     if not candidates:
         raise ValueError("average: there is no fit to average")
     if weights is None:
-        fits = {name: one.fit if isinstance(one, Posterior) else one for name, one in candidates.items()}
-        weights = {name: score.weight for name, score in model_scores(fits, progress, options).items()}
+        scores = model_scores(fits_of(candidates), progress, options)
+        weights = {name: score.weight for name, score in scores.items()}
     total = float(sum(weights.get(name, np.nan) for name in candidates))
     if set(weights) != set(candidates) or min(weights.values()) < 0.0 or not total > 0.0:
         raise ValueError(

@@ -14,8 +14,7 @@ from typing import TYPE_CHECKING, Any
 import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.optimize import minimize
-from scipy.special import log_softmax, logsumexp, softmax
+from scipy.special import logsumexp, softmax
 
 from fits.data.geometry import Floats
 from fits.data.measurements import Measurements
@@ -42,9 +41,8 @@ DRAWS = 128
 INFINITE_NOISE = 1e8
 """Noise with which a measurement does not influence a fit, in units of the largest measurement."""
 
-LARGEST_LOG_RATIO = 30.0
-"""Bound of the logarithms of ratios of stacking weights."""
-
+STACKING_STEPS = 20_000
+"""Steps of the expectation maximisation of stacking weights, at most."""
 
 Checkpoint = Callable[[str, Callable[[], Any]], Any]
 """Gives the record of this name: what the call computes, or what an earlier run has kept of it."""
@@ -297,26 +295,13 @@ def rank_models(
 
 
 def stacking(log_density: Floats) -> Floats:
-    """Weights (K,) of K predictions whose mixture has the highest log-density over N measurements, from (K, N)."""
-    count = len(log_density)
-    if count == 1:
-        return np.ones(1)
+    """Weights (K,) of K predictions whose mixture has the highest log-density over N measurements, from (K, N).
 
-    def cost(free: Floats) -> float:
-        logs = log_softmax(np.append(free, 0.0))
-        return -float(np.mean(logsumexp(log_density + logs[:, None], axis=0)))
-
-    def gradient(free: Floats) -> Floats:
-        weights = softmax(np.append(free, 0.0))
-        responsibility = softmax(log_density + np.log(weights)[:, None], axis=0).mean(axis=1)
-        return (weights - responsibility)[:-1]
-
-    optimum = minimize(
-        cost,
-        np.zeros(count - 1),
-        jac=gradient,
-        method="L-BFGS-B",
-        bounds=[(-LARGEST_LOG_RATIO, LARGEST_LOG_RATIO)] * (count - 1),
-        options={"ftol": 1e-14, "gtol": 1e-9},
-    )
-    return softmax(np.append(optimum.x, 0.0))
+    By expectation maximisation: the mean share of each prediction in the density of a measurement is its next weight.
+    """
+    logs = np.full(len(log_density), -math.log(len(log_density)))
+    for _ in range(STACKING_STEPS):
+        before, logs = logs, np.log(softmax(log_density + logs[:, None], axis=0).mean(axis=1) + np.finfo(float).tiny)
+        if np.max(np.abs(np.exp(logs) - np.exp(before))) < 1e-10:
+            break
+    return np.exp(logs)

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from fits.sampling.proposals import Density
 
 LEVELS = (0.025, 0.25, 0.5, 0.75, 0.975)
-"""Quantiles that are computed by default: the ends of the central 50 % and 95 % intervals, and the median."""
+"""Quantiles of a `Summary`: the ends of the central 50 % and 95 % intervals, and the median."""
 
 COVERAGES = (0.5, 0.95)
 """Central intervals whose coverage is scored."""
@@ -62,7 +62,7 @@ SMALLEST_SD = 1e-12
 
 @dataclass(frozen=True, eq=False)
 class Summary:
-    """Mean and standard deviation of M values in C channels, (M, C), and quantiles, (levels, M, C), in 1/sr."""
+    """Mean and standard deviation of M values in C channels, (M, C), and quantiles at `LEVELS`, (5, M, C), in 1/sr."""
 
     mean: Floats
     sd: Floats
@@ -76,7 +76,6 @@ class Prediction:
     Attributes:
         wi, wo: directions, (M, 3).
         channels: C names.
-        levels: levels of the quantiles.
         values: the stack's own value for each of D draws of the posterior, (D, M, C), in 1/sr.
         means, scales: location and scale of a measurement for each draw, (D, M, C), in 1/sr; with a discrepancy, of its
             `logarithm`.
@@ -94,7 +93,6 @@ class Prediction:
     wi: Floats
     wo: Floats
     channels: tuple[str, ...]
-    levels: tuple[float, ...]
     values: Floats
     means: Floats
     scales: Floats
@@ -144,7 +142,7 @@ class Prediction:
 
     def _summary(self, values: Floats) -> Summary:
         values = values.reshape(-1, *values.shape[-2:])
-        return Summary(values.mean(axis=0), values.std(axis=0), np.quantile(values, self.levels, axis=0))
+        return Summary(values.mean(axis=0), values.std(axis=0), np.quantile(values, LEVELS, axis=0))
 
     def quantile(self, level: float) -> Floats:
         """Quantile of the BSDF, (M, C), in 1/sr; level in (0, 1)."""
@@ -260,9 +258,7 @@ def scores(prediction: Prediction, measurements: Measurements, rows: NDArray[np.
 class Predictor(Protocol):
     """Several fits that predict as one: see `fits.average`."""
 
-    def predict(
-        self, at: Geometry | Measurements, *, levels: tuple[float, ...], draws: int, seed: int
-    ) -> Prediction: ...
+    def predict(self, at: Geometry | Measurements, *, draws: int, seed: int) -> Prediction: ...
 
 
 @programs_kept()
@@ -270,7 +266,6 @@ def predict(
     fitted: Fit | Posterior | Predictor,
     at: Geometry | Measurements,
     *,
-    levels: tuple[float, ...] = LEVELS,
     draws: int = DRAWS,
     seed: int = 0,
 ) -> Prediction:
@@ -281,27 +276,23 @@ def predict(
             joint fit by its normal approximation; or an average.
         at: pairs of directions in the upper hemisphere, or the lower one of a stack without a base; of `Measurements`
             their used samples, with their own sigma.
-        levels: levels of the quantiles, in (0, 1).
         draws: draws of the posterior, at least 2.
         seed: random seed of draws and noise.
 
     Measurements whose sigma is not known have the median sigma of the fitted ones, relative to the model.
 
     Raises:
-        ValueError: a level or number of draws out of range, a fit of a named objective, measurements in other channels,
+        ValueError: a number of draws out of range, a fit of a named objective, measurements in other channels,
             directions below an opaque stack, or directions that the transport does not support.
     """
-    require_kind("levels", levels, tuple, list, np.ndarray)
-    for place, level in enumerate(levels):
-        require_number(f"levels[{place}]", level, 0.0, 1.0, open_ends=True)
     require_count("draws", draws, 2)
     require_seed(seed)
     require_kind("at", at, Geometry, Measurements, fix=TO_HAVE_THEM)
     if not isinstance(fitted, Fit | Posterior):
         if isinstance(fitted, type) or not hasattr(fitted, "predict"):
             raise ValueError(f"fitted: {in_short(fitted)} is not a Fit, a Posterior or an Average")
-        return fitted.predict(at, levels=levels, draws=draws, seed=seed)
-    return posterior_predictive(fitted, at, levels=levels, draws=draws, seed=seed)
+        return fitted.predict(at, draws=draws, seed=seed)
+    return posterior_predictive(fitted, at, draws=draws, seed=seed)
 
 
 def posterior_predictive(
@@ -310,7 +301,6 @@ def posterior_predictive(
     *,
     draws: int,
     seed: int,
-    levels: tuple[float, ...] = LEVELS,
     proposal: "Density | None" = None,
 ) -> Prediction:
     """`predict` for one fit; proposal: an approximation of its posterior (see `importance_draws`), if there is one."""
@@ -327,7 +317,6 @@ def posterior_predictive(
         wi=data.wi,
         wo=data.wo,
         channels=channels,
-        levels=levels,
         values=values,
         means=means,
         scales=scales,

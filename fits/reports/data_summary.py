@@ -1,32 +1,21 @@
-"""What is in a measurement file: tables of its content, and sentences on reciprocity, energy, symmetry, sampling and
+"""What is in a measurement file: tables of its content, and sentences on doubtful angles, reciprocity, energy and
 repeated measurements (see `fits.data.checks`)."""
 
 import math
 
 import numpy as np
 
-from fits.data.checks import (
-    BRIGHTER,
-    FAR,
-    Agreement,
-    Energy,
-    Peak,
-    Sides,
-    energies,
-    peaks,
-    reciprocity,
-    repeats,
-    sides,
-    symmetry,
-)
+from fits.data.checks import Agreement, energies, reciprocity, repeats, sides
 from fits.data.measurements import Measurements
 from fits.data.scans import in_plane, incidences
 from fits.data.totals import Totals
 from fits.reports.tables import Table, degrees, shortened
-from fits.reports.verdicts import DEFAULT, ReportOptions
 
-MOST_CHANNELS, MOST_ENERGIES, MOST_ANGLES = 12, 6, 24
+MOST_CHANNELS, MOST_ENERGIES, MOST_ANGLES = 6, 6, 24
 """Shown one by one: channels, incidences with an energy, and incidences in a line."""
+
+BRIGHTER = 1.3
+"""Ratio of the brightest measurements of two sides above which one side is the brighter beyond noise."""
 
 
 def source_rows(data: Measurements) -> tuple[tuple[str, str], ...]:
@@ -83,87 +72,59 @@ def data_table(data: Measurements) -> Table:
         rows.append((*angles, *map(str, counts), *ranges))
     heads = tuple(f"BRDF {channel}" for channel in data.channels) if few else ("BRDF",)
     names = ("theta_i", "phi_i", "theta_o", "count", "used", "in plane", *heads)
-    return Table("Angles, and BRDF in 1/sr", names, shortened(rows), keys=2)
+    return Table("Angles, and BRDF in 1/sr", names, shortened(rows))
 
 
 def doubtful_angles(data: Measurements) -> list[str]:
     """Sentences on angles that were probably meant otherwise: radians, azimuths from the mirror direction."""
-    total = isinstance(data, Totals)
+    words, total = [], isinstance(data, Totals)
     largest = np.max(data.theta_i if total else np.concatenate([data.theta_i, data.theta_o]), initial=0.0)
-    words = [] if total else _brighter_side(sides(data))
     if 0.0 < largest < 1.6:  # a little more than a right angle in radians
-        words.insert(0, f"Angles: none is above {largest:.4g}°: are they radians? They were read as degrees.")
-    return words
+        words.append(f"Angles: none is above {largest:.4g}°: are they radians? They were read as degrees.")
+    if total or not (scans := sides(data)):
+        return words
+    brighter = [one for one in scans if one.light > BRIGHTER * max(one.mirror, 0.0)]
+    if all(math.isnan(one.mirror) for one in scans):
+        where = "all measurements in the plane of incidence lie on the light's side"
+    elif len(brighter) > sum(one.mirror > BRIGHTER * max(one.light, 0.0) for one in scans):
+        worst = max(brighter, key=lambda one: one.light)
+        where = f"the brightest side is the light's: at {worst.theta:g}° up to {worst.light:.3g} there"
+        where = f"{where}, and {worst.mirror:.3g} on the mirror side"
+    else:
+        return words
+    return [
+        *words,
+        f"Sides: {where}. Unless the sample is retro-reflective, azimuths of this file count from the mirror "
+        "direction, which must lie at phi_o = phi_i + 180.",
+    ]
 
 
-def data_statements(data: Measurements, options: ReportOptions = DEFAULT) -> list[str]:
-    """Sentences on angles that look wrong, reciprocity, energy, symmetry, sampling and repeats of the used data; of
-    totals on angles only."""
+def data_statements(data: Measurements) -> list[str]:
+    """Sentences on angles that look wrong, reciprocity, energy and repeats of the used data; of totals on angles."""
     if isinstance(data, Totals):
         return doubtful_angles(data)
+
+    def agreement(what: str, pairs: Agreement | None) -> str:
+        if pairs is None:
+            return f"there are no measurements {what}"
+        words = f"{pairs.number:,} pairs of measurements {what} differ by {100.0 * pairs.median:.2g} %"
+        return f"{words} (median; 95 % of them by up to {100.0 * pairs.p95:.2g} %)"
+
+    energy, known = (
+        "no incidence is measured over half of the hemisphere, the directional albedo is unknown",
+        energies(data),
+    )
+    if known:
+        shares = [("/".join(f"{part:.3g}" for part in one.share), one) for one in known[:MOST_ENERGIES]]
+        parts = [f"{share} at {one.theta:g}° over {100.0 * one.covered:.0f} % of it" for share, one in shares]
+        energy = f"directional albedo over the measured part of the projected hemisphere: {'; '.join(parts)}"
+    if above := [f"{one.theta:g}°" for one in known if max(one.share) > 1.0]:
+        energy = f"{energy}. It exceeds 1 at {', '.join(above)}: the scale is wrong"
     repeated = repeats(data)
     noise = "" if repeated is None else f", a noise of about {100.0 * repeated.noise:.2g} %"
     return [
         *doubtful_angles(data),
-        f"Reciprocity: {_agreement('with light and viewer exchanged', reciprocity(data))}.",
-        _energy(energies(data)),
-        f"Symmetry: {_agreement('on either side of the plane of incidence', symmetry(data))}.",
-        _sampling(peaks(data), options),
-        f"Repeats: {_agreement('along the same directions', repeated)}{noise}.",
+        f"Reciprocity: {agreement('with light and viewer exchanged', reciprocity(data))}.",
+        f"Energy: {energy}.",
+        f"Repeats: {agreement('along the same directions', repeated)}{noise}.",
     ]
-
-
-def _agreement(what: str, pairs: Agreement | None) -> str:
-    """How well pairs of measurements agree that should."""
-    if pairs is None:
-        return f"there are no measurements {what}"
-    median, most = 100.0 * pairs.median, 100.0 * pairs.p95
-    errors = "" if math.isnan(pairs.z) else f", {pairs.z:.2g} of their standard errors"
-    words = f"{pairs.count:,} pairs of measurements {what} differ by {median:.2g} %"
-    return f"{words} (median; 95 % of them by up to {most:.2g} %){errors}"
-
-
-def _brighter_side(by_incidence: list[Sides]) -> list[str]:
-    """That the brightest side is the light's, where it is: azimuths may be counted from the mirror direction."""
-    brighter = [one for one in by_incidence if one.light > BRIGHTER * max(one.mirror, 0.0)]
-    if by_incidence and all(math.isnan(one.mirror) for one in by_incidence):
-        where = "all measurements in the plane of incidence lie on the light's side"
-    elif len(brighter) <= sum(one.mirror > BRIGHTER * max(one.light, 0.0) for one in by_incidence):
-        return []
-    else:
-        worst = max(brighter, key=lambda one: one.light)
-        where = f"the brightest side is the light's: at {worst.theta:g}° up to {worst.light:.3g} there"
-        where = f"{where}, and {worst.mirror:.3g} on the mirror side"
-    return [
-        f"Sides: {where}. Unless the sample is retro-reflective, azimuths of this file count from the mirror "
-        "direction, which must lie at phi_o = phi_i + 180."
-    ]
-
-
-def _energy(by_incidence: list[Energy]) -> str:
-    if not by_incidence:
-        return "Energy: no incidence is measured over half of the hemisphere, the directional albedo is unknown."
-    shares = [("/".join(f"{part:.3g}" for part in one.share), one) for one in by_incidence[:MOST_ENERGIES]]
-    parts = [f"{share} at {one.theta:g}° over {100.0 * one.covered:.0f} % of it" for share, one in shares]
-    words = f"Energy: directional albedo over the measured part of the projected hemisphere: {'; '.join(parts)}."
-    above = [f"{one.theta:g}°" for one in by_incidence if max(one.share) > 1.0]
-    return f"{words} It exceeds 1 at {', '.join(above)}: the scale is wrong." if above else words
-
-
-def _sampling(by_incidence: list[Peak], options: ReportOptions) -> str:
-    """Whether the width of the peak about the mirror direction is sampled, where it is sampled least."""
-    if not by_incidence:
-        return "Sampling: no scan crosses the mirror direction of its light, the peak was not measured."
-    standing = [one for one in by_incidence if one.stands_out]
-    if not standing:
-        return (
-            f"Sampling: no peak stands out about the mirror direction: measurements within {FAR:g}° of it nowhere fall "
-            "to half of the brightest one."
-        )
-    worst = min(standing, key=lambda one: one.count)
-    narrow = "the peak may be narrower than the steps, which then limit a fitted roughness"
-    return (
-        "Sampling: measurements above half the height of the peak about the mirror direction: "
-        f"{worst.count} or more (at {worst.theta:g}°, in steps of {worst.step:.2g}°): "
-        f"{narrow if worst.count < options.peak_points else 'its width is sampled'}."
-    )

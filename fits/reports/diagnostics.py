@@ -49,13 +49,11 @@ def misfit(fit: "Fit") -> np.ndarray:
     return over_all_rows(fit, independent / _unit(fit))
 
 
-def residual_label(fit: "Fit", whitened: bool = True) -> str:
-    """The name of an axis of `standardised` residuals, or of a `misfit` where they are not whitened."""
+def residual_label(fit: "Fit") -> str:
+    """The name of an axis of a `misfit`."""
     if not fit.is_posterior:
         return f"residual of {fit.problem.objective} / its scatter"
-    if not fit.problem.noise.discrepancy:
-        return r"(data $-$ model) / $\sigma$"
-    return "whitened residual" if whitened else r"(data $-$ with discrepancy) / $\sigma$"
+    return rf"(data $-$ {'with discrepancy' if fit.problem.noise.discrepancy else 'model'}) / $\sigma$"
 
 
 def _unit(fit: "Fit") -> float:

@@ -6,7 +6,7 @@ problem.toml   the stack with its free parameters, noise and scale, as given
 fitted.toml    the same stack with the fitted values
 fit.json       every number of the fit, its settings, and the versions that made it; checksums of it and of these files
 chain.db       the posterior's chain, once sampled, and summary.json with its estimates
-report.html    the report, and its pictures as *.png
+report.html    the report, pictures inside
 """
 
 import shutil

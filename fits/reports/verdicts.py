@@ -48,9 +48,6 @@ class ReportOptions:
     prior_dominated: float = 0.3
     """Standard error, as a share of the bounds, above which a parameter is called prior-dominated."""
 
-    peak_points: int = 3
-    """Measurements above half the height of a peak from which its width is called sampled."""
-
     def __post_init__(self) -> None:
         for field in fields(self):
             require_number(f"ReportOptions.{field.name}", getattr(self, field.name), 0.0)
@@ -434,7 +431,7 @@ def noise_statements(problem: "Problem") -> list[str]:
         pairs = None if isinstance(used, Totals) else repeats(used)
         if pairs is None or not pairs.noise > 0.0:
             return [f"{words} State it as `relative` under [noise], or `--noise` of a search."]
-        scatter = f"{pairs.count:,} repeated measurements scatter by about {100.0 * pairs.noise:.2g} %"
+        scatter = f"{pairs.number:,} repeated measurements scatter by about {100.0 * pairs.noise:.2g} %"
         return [
             f"{words} {scatter}: `relative = {pairs.noise:.2g}` under [noise], or `--noise` of a search, states that."
         ]

@@ -88,7 +88,7 @@ KEYWORDS = {
     "report": ({"fit": FIT, "path": "there.html"}, "path posterior* others* held_out* options"),
     "search": ({"data": DATA}, "seed options* directory* progress*"),
     "simulate": (FUNCTIONS["simulate"], "noise floor seed"),
-    "predict": (FUNCTIONS["predict"], "levels draws seed"),
+    "predict": (FUNCTIONS["predict"], "draws seed"),
     "scores": ({"prediction": None, "measurements": DATA}, "prediction"),
     "sample": ({"fit": FIT}, "ess* sampler walkers* max_steps* options* seed path*"),
     "evidence": ({"fit": FIT}, "draws seed"),

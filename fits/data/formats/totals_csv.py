@@ -94,7 +94,7 @@ def read(path: Path) -> Totals:
     notes = [f"columns not used: {', '.join(ignored)}"] if ignored else []
     if empty := int(np.count_nonzero(~rows)):
         notes.append(f"skipped: {plural(empty, 'row')} without a value (an empty cell, or nan)")
-    return replace(totals, source=Source(str(path), "csv", notes=(*notes, *totals.energy_violations())))
+    return replace(totals, source=Source(str(path), "csv", notes=tuple(notes)))
 
 
 def write(totals: Totals, path: str | Path, force: bool = False) -> None:

@@ -104,7 +104,7 @@ def _pair(map: FittedMap, *figures: tuple[str, Figure]) -> str:
     """Pictures beside each other, with what each shows."""
     leading = _leading(map.shape)
     part = f" Slice {list(leading)} of {' x '.join(str(size) for size in map.shape[:-2])}." if leading else ""
-    shown = (image({"": as_png(figure, trimmed=False)}, "", f"{words}{part}") for words, figure in figures)
+    shown = (image(as_png(figure, trimmed=False), f"{words}{part}") for words, figure in figures)
     return f'<div class="pair">{"".join(shown)}</div>'
 
 

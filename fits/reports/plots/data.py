@@ -91,70 +91,42 @@ def data_picture(data: "Measurements") -> Figure:
     return figure
 
 
-def residual_picture(data: "Measurements", residuals: np.ndarray, label: str) -> Figure:
-    """What structure standardised residuals (N, C) have along angle, and their distribution; label: what they are."""
-    from scipy import stats
-
-    finite, shown = residuals[np.isfinite(residuals)], chosen(data)
-    with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(9.5, 3.6), layout="constrained")
-        along, often = figure.subplots(1, 2, width_ratios=(2.0, 1.0))
-        along.axhspan(-1.0, 1.0, color="#eeeeee", zorder=0)
-        for incidence, colour in zip(shown, ordered_colours(len(shown)), strict=True):
-            angle = np.repeat(signed_angle(data)[incidence.rows], residuals.shape[1])
-            points: dict[str, Any] = {"markersize": 2.5, "markeredgewidth": 0.0, "label": incidence.label}
-            along.plot(angle, residuals[incidence.rows].ravel(), "o", color=colour, **points)
-        along.set(xlabel=ANGLE_LABEL, ylabel=label, title="Along angle; grey: ±1")
-        along.legend(ncols=min(len(shown), 5), loc="lower right", bbox_to_anchor=(1.0, 1.0), columnspacing=1.0)
-        edge = float(np.clip(np.abs(finite).max(), 4.0, 12.0))
-        bins = np.linspace(-edge, edge, int(np.clip(np.sqrt(finite.size) * 1.5, 16, 60)))
-        grid = np.linspace(-edge, edge, 301)
-        often.hist(np.clip(finite, -edge, edge), bins=bins.tolist(), density=True, color=CYCLE[5], label="residuals")
-        often.plot(grid, stats.norm.pdf(grid), color=INK, linewidth=1.2, label="unit normal")
-        often.set(xlabel=label, ylabel="density", title="Distribution")
-        often.legend(loc="upper right")
-    return figure
-
-
 def totals_picture(totals: Totals, fit: "Fit | None" = None) -> Figure:
-    """A panel for each kind: measured shares of the incident flux against the channel, or the angle of incidence where
-    there is but one channel, and those of the fit."""
-    kinds, channels = [kind for kind in KINDS if kind in totals.kinds], np.arange(len(totals.channels))
-    angles = list(dict.fromkeys(f"{angle:g}°" for angle in totals.theta_i))
+    """A panel for each kind: measured shares of the incident flux, and those of the fit, against the channel, or the
+    angle of incidence where there is but one channel; a colour for each angle."""
+    kinds, channels = [kind for kind in KINDS if kind in totals.kinds], totals.channels
+    angles, single = sorted(set(totals.theta_i)), len(channels) == 1
+    marks: dict[str, Any] = {}
     predicted = np.full(totals.values.shape, np.nan)
     if fit is not None:
         predicted[totals.mask] = fit.predicted
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(9.5, 3.2), layout="constrained")
         panels = figure.subplots(1, len(kinds), squeeze=False)[0]
-        marks: dict[str, Any] = {}
         for axes, kind in zip(panels, kinds, strict=True):
-            lines: list[tuple[Any, Any, Any, str]]
-            rows = np.flatnonzero([one == kind for one in totals.kinds])
-            if len(channels) == 1:
-                rows = rows[np.argsort(totals.theta_i[rows], kind="stable")]
-                lines = [(totals.theta_i[rows], rows, 0, "")]
+            own = np.flatnonzero([one == kind for one in totals.kinds])
+            own = own[np.argsort(totals.theta_i[own], kind="stable")]
+            for rows in own[None] if single else own[:, None]:
+                x, angle = totals.theta_i[rows] if single else np.arange(len(channels)), totals.theta_i[rows[0]]
+                label = "" if single or len(angles) == 1 else f" at {angle:g}°"
+                sigma = None if totals.sigma is None else totals.sigma[rows].ravel()
+                points: dict[str, Any] = {"fmt": "o", "color": INK, "markersize": 3, "capsize": 2}
+                axes.errorbar(x, totals.values[rows].ravel(), sigma, label=f"measured{label}", **points)
+                if fit is not None:
+                    colour = CYCLE[0 if single else angles.index(angle) % len(CYCLE)]
+                    shape = "-" if len(x) > 1 else "x"
+                    axes.plot(x, predicted[rows].ravel(), shape, color=colour, label=f"fit{label}")
+            if single:
                 axes.set_xlabel("angle of incidence, degrees")
             else:
-                lines = [(channels, row, channels, f"{totals.theta_i[row]:g}°") for row in rows]
-                shown = channels[:: -(-len(channels) // 12)]
-                axes.set_xticks(shown, [totals.channels[place] for place in shown], rotation=45, ha="right")
-            for x, row, channel, angle in lines:
-                colour, label = CYCLE[0], ""
-                if angle and len(angles) > 1:
-                    colour, label = CYCLE[angles.index(angle) % len(CYCLE)], f" at {angle}"
-                errors = None if totals.sigma is None else totals.sigma[row, channel]
-                points: dict[str, Any] = {"fmt": "o", "color": INK, "markersize": 3, "capsize": 2}
-                axes.errorbar(x, totals.values[row, channel], errors, label=f"measured{label}", **points)
-                if fit is not None:
-                    shape = "-" if len(x) > 1 else "x"
-                    axes.plot(x, predicted[row, channel], shape, color=colour, label=f"fit{label}")
+                ticks = range(0, len(channels), -(-len(channels) // 12))
+                axes.set_xticks(ticks, [channels[place] for place in ticks], rotation=45, ha="right")
             axes.margins(y=0.1)
             axes.set_ylim(bottom=0.0)
             axes.set_title("collimated transmittance" if kind == "unscattered" else f"total {kind}")
             marks |= {label: handle for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)}
         panels[0].set_ylabel("share of the incident flux")
-        figure.legend(marks.values(), marks.keys(), loc="outside lower center", ncols=min(len(marks), 6))
+        figure.legend(list(marks.values()), list(marks), loc="outside lower center", ncols=min(len(marks), 6))
     return figure
 
 

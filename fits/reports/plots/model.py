@@ -189,7 +189,7 @@ def maps_picture(fit: "Fit", channel: int = 0) -> Figure | None:
                 axes.set_title(f"{incidence.label}: {what}")
         bar: dict[str, Any] = {"shrink": 0.7, "aspect": 30}
         figure.colorbar(image, ax=panels[:, :2].ravel().tolist(), label=value_label(data, channel), **bar)
-        label = residual_label(fit, whitened=False)
+        label = residual_label(fit)
         figure.colorbar(signed, ax=panels[:, 2].tolist(), label=label, extend="both", **bar)
     return figure
 

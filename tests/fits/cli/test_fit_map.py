@@ -76,10 +76,9 @@ def test_defaults_and_options_arrive(place, run):
     assert given["options"] == MapOptions(**counts, emulator=False, force=True, spatial_prior=prior)
     assert (given["sigma"], given["mask"], given["noise"]) == ("sigma.npy", "mask.npy", Noise(relative=0.02))
     _, given = run(
-        "--scheduler tcp://10.0.0.1:8786 --emulator always --spatial-prior total_variation --spatial-rounds 3 "
-        "--spatial-scale base.albedo=0.1 scale=1"
+        "--scheduler tcp://10.0.0.1:8786 --emulator always --spatial-prior total_variation --spatial-scale 0.2"
     )
-    prior = SpatialPrior("total_variation", {"base.albedo": 0.1, "scale": 1.0}, 3)
+    prior = SpatialPrior("total_variation", 0.2)
     assert given["client"] == "tcp://10.0.0.1:8786"
     assert given["options"] == MapOptions(emulator=True, spatial_prior=prior)
     # the stack file says the rest
@@ -145,13 +144,8 @@ def test_an_interrupt_says_that_the_store_is_good(place, capsys, monkeypatch):
         ("view.csv=coat.toml", "coat.toml, line"),
         ("coat.zarr=coat.h5", "coat.h5: a fitted map can be written as .zarr only"),
         ("coat.zarr=file.zarr", "file.zarr: is a file"),
-        ("--spatial-prior gaussian", "--spatial-prior gaussian needs --spatial-scale"),
-        ("--spatial-scale 0.1", "--spatial-scale is given without --spatial-prior"),
-        (
-            "--spatial-prior gaussian --spatial-scale 0.1 scale=0.1",
-            "one number for all parameters, or one for each name",
-        ),
-        ("--spatial-prior gaussian --spatial-scale scale=0", "SpatialPrior.scale['scale'] is 0.0; it must be a number"),
+        ("--spatial-prior gaussian", "--spatial-prior needs --spatial-scale"),
+        ("--spatial-prior gaussian --spatial-scale 0", "SpatialPrior.scale is 0.0; it must be a number"),
     ],
 )
 def test_bad_input_is_named(place, capsys, words, message):

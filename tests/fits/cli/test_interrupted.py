@@ -68,10 +68,9 @@ def test_an_interrupt_says_how_to_resume(work, capsys, coat_fit, monkeypatch, pl
     [
         (["convert", "data.csv", "out.csv", "--force"], "out.csv"),
         (["simulate", "--stack", "coat.toml", "--out", "out.csv", "--force"], "out.csv"),
-        (["render", "coat.toml", "--size", "16", "--out", "out.png", "--force"], "out.png"),
+        (["render", "coat.toml", "--out", "out.png", "--force"], "out.png"),
         (["info", "data.csv", "--out", "out.png", "--force"], "out.png"),
-        (["compare", "one", "two", "--no-refit", "--out", "out.html", "--force"], "out.html"),
-        (["report", "one"], "one"),
+        (["report", "one"], "one/report.html"),
         (["sample", "one"], "one/chain.db"),
     ],
     ids=lambda value: value[0] if isinstance(value, list) else "",
@@ -81,7 +80,7 @@ def test_a_full_disk_is_one_line_and_changes_nothing(work, capsys, coat_fit, wor
     monkeypatch.setattr("fits.reports.render.render", lambda *_, **__: data_picture(coat_fit.problem.data))
     for directory in ("one", "two"):
         save_fit(coat_fit, directory)
-    for output in ("out.csv", "out.png", "out.html", "one/report.html"):
+    for output in ("out.csv", "out.png", "one/report.html"):
         (work / output).write_text("precious")
     before = contents(work)
     with largest_file(6_000):
@@ -116,7 +115,7 @@ def test_a_fit_on_a_full_disk_keeps_its_starts_and_the_earlier_result(work, caps
     before = contents(work)
     words = [*FIT, "--starts", "3", "--force"]
     with largest_file(30_000):
-        assert refusal(words, capsys) == "layerjax: error: result: file too large"
+        assert refusal(words, capsys) == "layerjax: error: result/report.html: file too large"
     after = contents(work)
     after.pop(str(work / ".result.starts"))
     assert len(Store.read(".result.starts").keys()) == 3

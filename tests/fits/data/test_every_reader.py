@@ -15,8 +15,6 @@ BINARY = ("merl", "rgl")
 TEXT = sorted(set(FILES) - set(BINARY))
 NUMBER = rb"(?<![\w.+-])[-+]?\d+(\.\d*)?([eE][-+]?\d+)?(?![\w.])"
 
-pytestmark = pytest.mark.filterwarnings("ignore:.*more than 3 standard deviations:UserWarning")
-
 
 @pytest.fixture
 def found(tmp_path):

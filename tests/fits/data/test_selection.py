@@ -1,17 +1,15 @@
-"""Readings by what a user thinks in."""
+"""Measurements are selected by the angles that a user thinks in, by arguments and by words."""
 
 import numpy as np
 import pytest
 
 from fits.data.geometry import slices
 from fits.data.measurements import Measurements
-from fits.data.scans import scans, signed_angle
-from fits.data.selection import BLOCK, select
+from fits.data.selection import select
+from tests.helpers.models import along
 
 PLANES = slices([10.0, 30.0, 50.0], np.arange(-80.0, 81.0, 2.0), [0.0, 60.0])
-EVERY = np.ones(len(PLANES), bool)
-DATA = Measurements(PLANES.wi, PLANES.wo, np.ones((len(PLANES), 1)), None, EVERY, ("value",))
-ANGLE = signed_angle(DATA)
+DATA = along(PLANES)
 TURNED = np.abs(np.sin(np.radians(DATA.phi_o))) > 0.1
 """Data in the plane of azimuth 60; the normal belongs to the other."""
 
@@ -19,27 +17,13 @@ TURNED = np.abs(np.sin(np.radians(DATA.phi_o))) > 0.1
 @pytest.mark.parametrize(
     ("words", "expected"),
     [
-        ("incidence=30", np.abs(DATA.theta_i - 30.0) < 0.1),
         ("incidence=10,50.2", np.abs(DATA.theta_i - 30.0) > 0.1),
-        ("angle=-20:40", (ANGLE > -20.1) & (ANGLE < 40.1)),
-        ("angle=-70:-60,12", (ANGLE < -59.9) & (ANGLE > -70.1) | (ANGLE == 12)),
-        ("plane=60", TURNED),
-        ("plane=0", ~TURNED),
+        ("theta_o=20:40", (DATA.theta_o > 19.9) & (DATA.theta_o < 40.1)),
+        ("azimuth=60", TURNED),
     ],
 )
 def test_words_select(words, expected):
     np.testing.assert_array_equal(select(DATA, words), expected)
-
-
-@pytest.mark.parametrize("share", [0.1, 0.25, 0.5, 0.9])
-def test_a_share_is_of_whole_blocks_of_every_scan(share):
-    chosen = select(DATA, f"share={share}")
-    np.testing.assert_array_equal(chosen, select(DATA, f"share={share}"))
-    for rows in scans(DATA):
-        block = np.floor((ANGLE[rows] - ANGLE[rows].min()) / BLOCK)
-        whole = [chosen[rows][block == each] for each in np.unique(block)]
-        assert all(part.all() or not part.any() for part in whole)
-        assert abs(np.mean([part.all() for part in whole]) - share) <= 1.0 / len(whole)
 
 
 @pytest.mark.parametrize(
@@ -78,7 +62,6 @@ def test_channels_are_selected():
     for given, message in (
         ({"channels": "grey"}, "channel grey is not in the data; there are red, green, blue"),
         ({"channels": "red", "incidence": 10}, "drop: channels are given together with angles"),
-        ({"channels": ["red", "green", "blue"]}, "drop: no sample of the data remains"),
         ({"incidence": 10}, "drop: no sample of the data remains"),
     ):
         with pytest.raises(ValueError, match=message):
@@ -89,19 +72,12 @@ def test_channels_are_selected():
     ("asked", "message"),
     [
         ("incidence=35", "incidence 35 is not in the data; there are 10, 30, 50 degrees"),
-        ("incidence=10,ten", "incidence is 'ten'; it must be a number"),
-        ("incidence=", "incidence is ''; it must be a number"),
-        ("plane=90", "plane 90 is not in the data; there are 0, 60 degrees"),
-        ("angle=85:89", "angle 85:89 is not in the data; they go from -80 to 80 degrees"),
-        ("angle=20:-20", "angle 20:-20 is empty: its first angle must not be above its second"),
-        ("share=1.5", "share is 1.5; it must be above 0 and below 1"),
-        ("incidences=30", "'incidences=30' is no selection; it must be one of incidence=..., plane=..., angle=..."),
-        ("30", "'30' is no selection"),
+        ("incidence=10,ten", "incidence is '10,ten'; it must be angles in degrees, as in 10,50 or 20:60"),
+        ("theta_o=40:20", "theta_o is slice(40.0, 20.0, None); it must be slice(low, high)"),
+        ("incidences=30", "'incidences=30' is no selection; it must be one of incidence=..., azimuth=..., theta_o=..."),
         ({}, "select: no argument is given; it takes incidence, azimuth, theta_o, in_plane and channels"),
-        ({"incidence": 35}, "incidence 35 is not in the data; there are 10, 30, 50 degrees"),
         ({"azimuth": 90}, "azimuth 90 is not in the data; there are 0, 60 degrees"),
         ({"theta_o": [20, 85]}, "theta_o 85 is not in the data; they go from 0 to 80 degrees"),
-        ({"theta_o": slice(60, 20)}, "theta_o is slice(60, 20, None); it must be slice(low, high)"),
         ({"theta_o": slice(81, 85)}, "select: no sample of the data fulfils all of this"),
     ],
 )
@@ -109,8 +85,3 @@ def test_refused(asked, message):
     with pytest.raises(ValueError) as refused:  # noqa: PT011 (parentheses in what is looked for)
         select(DATA, asked) if isinstance(asked, str) else DATA.select(**asked)
     assert str(refused.value).startswith(message)
-
-
-def test_a_share_needs_a_scan_longer_than_a_block():
-    with pytest.raises(ValueError, match=r"^share 0\.5: no scan of the data is longer than a block of 10 degrees"):
-        select(DATA.where(np.arange(len(DATA)) < 2).used(), "share=0.5")

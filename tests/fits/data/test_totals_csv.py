@@ -22,7 +22,6 @@ def test_every_cell_is_a_reading(reading):
     np.testing.assert_allclose(found.theta_i, [0.0, 60.0, 0.0], atol=1e-9)
     assert found.wo[:, 2].tolist() == pytest.approx([1.0, 0.5, -1.0])
     assert found.source.notes == ("columns not used: operator",)
-    assert "1.2 together" in reading(f"{HEADER}\n0,0.7,0.01,0.5,0.02\n").source.notes[0]  # more than all the light
 
 
 @pytest.mark.parametrize("missing", ["", "nan", "NA"])
@@ -31,14 +30,6 @@ def test_rows_without_any_value_are_counted(reading, missing):
     found = reading(f"{head}0,0.3,0.5\n10,{missing},{missing}\n20,0.3,{missing}\n30,{missing},{missing}\n")
     np.testing.assert_allclose(found.values[:, 0], [0.3, 0.3, 0.5])
     assert found.source.notes == ("skipped: 2 rows without a value (an empty cell, or nan)",)
-
-
-def test_more_than_all_the_light_is_noted_of_a_file_and_warned_of_by_hand(reading):
-    said = "reflectance at 0 degrees, value, is 1.3: more than 1 by more than 3 standard deviations"
-    found = reading("theta_i,total_reflectance,total_reflectance_std\n0,1.3,0.01\n")
-    assert any(said in note for note in found.source.notes)
-    with pytest.warns(UserWarning, match=said):
-        Totals.of(0.0, reflectance=1.3, sigma=0.01)
 
 
 def test_channels_and_unscattered_light(reading):
