@@ -1,19 +1,11 @@
 """MERL tables: a file written from a formula in half and difference angles is looked up again, by angles or bins."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
-import layerjax as lj
-from fits.cli.parser import main
 from fits.data.formats.merl import half_difference
 from fits.data.geometry import Geometry, direction, slices
 from fits.data.reading import read
-from fits.data.scans import in_plane, incidences, relative_azimuth
-from fits.optimise.fit import fit
-from fits.problem.parameters import Free
-from tests.helpers.commands import refused
 from tests.helpers.data_files import written
 from tests.helpers.merl import SCALE, SHAPE, centre_angles, centre_pairs, smooth_bsdf, write_merl
 
@@ -63,6 +55,7 @@ def geometry():
 
 
 def test_centre_lookup_reads_bins_as_they_are_at_their_centre_angles(path, geometry, table):
+    assert sorted(set(read(path).theta_i.round(-1))) == [10, 30, 50, 70]  # the default slices
     for data in (read(path), read(path, geometry=geometry)):
         index = bins_of(own_angles(data))
         centres = ((index + 0.5) / SHAPE) ** [2, 1, 1] * [np.pi / 2, np.pi / 2, np.pi]
@@ -97,19 +90,6 @@ def test_a_pair_at_a_centre_stays_and_its_reciprocal_is_the_same_reading(path, t
     assert any("skipped: 4 of the 8 pairs requested" in note for note in both.source.notes)
 
 
-def test_centres_along_the_default_slices_remain_slices(path):
-    data = read(path)
-    assert 380 < len(data) < 420
-    groups = incidences(data)
-    np.testing.assert_allclose([group.theta for group in groups], [10.5, 30.5, 50.5, 70.5], atol=0.1)
-    np.testing.assert_allclose(data.phi_i, 180, atol=1e-8)
-    for group in groups:
-        assert np.count_nonzero(in_plane(data)[group.rows]) >= 25
-        theta_i, theta_o = data.theta_i[group.rows], data.theta_o[group.rows]
-        peak = in_plane(data)[group.rows] & (abs(relative_azimuth(data)[group.rows]) < 1)
-        assert abs(theta_o - theta_i)[peak].min() < 0.01  # the mirror direction
-
-
 def test_light_along_the_normal_and_pairs_at_the_horizon(path):
     upright = read(path, geometry=slices(incidence=0.0, outgoing=(-40.0, 0.0, 40.0)))
     assert upright.theta_i.max() < 0.75
@@ -120,38 +100,6 @@ def test_light_along_the_normal_and_pairs_at_the_horizon(path):
     assert len(read(path, geometry=Geometry(*low))) == 1
     with pytest.raises(ValueError, match="geometry holds only pairs too near the horizon"):
         read(path, geometry=Geometry(low[0][:1], low[1][:1]))
-
-
-def flakes(thickness, albedo):
-    medium = lj.Medium(thickness=thickness, albedo=0.9, phase=lj.SGGX("surface", 0.02))
-    return lj.Stack([medium], base=lj.Lambertian(albedo=albedo))
-
-
-@pytest.fixture(scope="module")
-def flakes_path(tmp_path_factory):
-    """An exact table of flakes of thickness 0.8 over Lambertian(0.5), with values near the default slices only."""
-    wi, wo = centre_pairs(np.stack(np.unravel_index(np.arange(np.prod(SHAPE)), SHAPE), axis=-1))
-    near = np.zeros(len(wi), bool)
-    for theta in (10.5, 30.5, 50.5, 70.5):
-        near |= (abs(np.degrees(np.arccos([wi[:, 2], wo[:, 2]])) - theta) < 0.3).any(axis=0)
-    near &= (wi[:, 2] > 0) & (wo[:, 2] > 0)
-    values = np.full(len(wi), -1.0)
-    values[near] = lj.evaluate(flakes(0.8, 0.5), wi[near], wo[near], lj.SingleScattering())[:, 0]
-    return write_merl(
-        tmp_path_factory.mktemp("merl") / "flakes.binary", np.broadcast_to(values.reshape(SHAPE), (3, *SHAPE))
-    )
-
-
-@pytest.mark.slow
-def test_an_exact_table_gives_back_its_stack(flakes_path):
-    data = read(flakes_path)
-    assert data.mask.all()
-    data = replace(data, sigma=0.01 * data.values)
-    start = flakes(Free(1.5, 0.05, 5.0), Free(0.3, 0.0, 1.0))
-    found = fit(start, data, transport=lj.SingleScattering(), starts=2)
-    assert found.converged
-    assert found.values["layers[0].thickness"] == pytest.approx(0.8, abs=1e-7)
-    assert found.values["base.albedo"] == pytest.approx(0.5, abs=1e-7)
 
 
 def test_linear_lookup_recovers_the_formula(path, geometry, table):
@@ -165,23 +113,8 @@ def test_linear_lookup_recovers_the_formula(path, geometry, table):
     assert data.mask.all()
     assert data.channels == ("red", "green", "blue")
     assert "centre at i + 1/2" in data.source.notes[0]
-    # mirror, normal and retro directions
-    edges = Geometry(direction([30, 0, 30, 80, 0], 180), direction([30, 0, -30, 80, 85], 0))
-    data, expected = read(path, geometry=edges, lookup="linear"), smooth_bsdf(*own_angles(edges)).T
-    assert data.mask.all()
-    np.testing.assert_allclose(data.values[:, :2], expected[:, :2], rtol=0.02)
-
-
-def test_nearest_lookup_takes_the_bin_of_the_database_code(path, geometry, table):
-    data = read(path, geometry=geometry, lookup="nearest")
-    np.testing.assert_allclose(data.values, table[:, *bins_of(own_angles(geometry)).T].T, rtol=1e-14)
-
-
-def test_default_slices(path):
-    data = read(path, lookup="linear")
-    assert len(data) == 4 * (35 + 34 + 34)
-    assert sorted(set(data.theta_i)) == [10, 30, 50, 70]
-    assert len(np.unique(np.hstack([data.wi, data.wo]).round(6), axis=0)) == len(data)
+    nearest = read(path, geometry=geometry, lookup="nearest")
+    np.testing.assert_allclose(nearest.values, table[:, *bins_of(own_angles(geometry)).T].T, rtol=1e-14)
 
 
 def test_bins_without_measurement_are_masked(tmp_path, table):
@@ -267,13 +200,6 @@ def test_a_choice_by_flux_has_means_of_the_hemisphere(path):
         assert found.mean() == pytest.approx(expected, abs=0.5 * found.std() / np.sqrt(COUNT))
 
 
-def test_on_the_command_line(holed_path, tmp_path, capsys):
-    words = ["convert", str(holed_path), str(tmp_path / "some.csv"), "--read", "strata=flux"]
-    assert "strata is given without a number of bins" in refused(words, capsys, tmp_path)
-    assert main([*words, "bins=50"]) == 0
-    assert len(read(tmp_path / "some.csv")) == 50
-
-
 # ---- what is refused ----
 
 
@@ -285,6 +211,7 @@ def test_bad_arguments(holed_path):
         ({"quantity": "brdf_cos"}, "a MERL file always holds 'brdf'"),
         *(({"bins": bad}, f"bins is {bad!r}, {bins}") for bad in (0, -3, 2.5, True, "most")),
         ({"bins": 200_000}, "bins is 200000, must be at most 100000 of the"),
+        ({"strata": "flux"}, "strata is given without a number of bins"),
         ({"bins": 10, "strata": "area"}, "strata is 'area', must be one of bins, flux"),
         ({"bins": 10, "seed": -1}, "seed is -1, must be a whole number"),
         ({"bins": 10, "lookup": "linear"}, "bins stands beside geometry or lookup"),

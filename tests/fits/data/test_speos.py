@@ -55,20 +55,6 @@ def test_a_file_of_speos():
         read(GAUSSIAN, quantity="brdf")
 
 
-def test_a_file_of_speos_holds_the_shares_that_it_states():
-    """4 % above and 95 % below at perpendicular incidence, and here at 30 degrees: integrals of the intensities."""
-    lines, data = GAUSSIAN.read_text().splitlines(), read(GAUSSIAN)
-    starts = [number for number, line in enumerate(lines) if line == "41 95"]
-    for start, stated, theta in zip(starts, (0.04, 0.95), (30, 160), strict=True):
-        phi, rows = np.loadtxt(lines[start + 1 : start + 2]), np.loadtxt(lines[start + 2 : start + 43])
-        polar = np.radians(rows[:, 0])
-        found = np.trapezoid(np.trapezoid(rows[:, 1:], np.radians(phi), axis=1) * np.sin(polar), polar)
-        assert found == pytest.approx(stated, rel=0.06)
-        at = rows[rows[:, 0] == theta, 1][0] * stated / found / abs(np.cos(np.radians(theta)))
-        here = (abs(data.theta_o - theta) < 1e-6) & (data.phi_o == 0)
-        np.testing.assert_allclose(data.values[here, 0], at, rtol=1e-2)  # trapezoids of a product, here
-
-
 def test_anisotropic_by_formula(reading):
     """Two rotations and incidences; the one factor is that of the incidence at which the spectrum was measured."""
     places = [(rotation, incidence) for rotation in (0.0, 30.0) for incidence in (10.0, 50.0)]

@@ -30,18 +30,6 @@ def test_astm_in_degrees_with_blanks_and_wavelengths(reading):
     assert data.source.notes[0].startswith("angles taken as degrees")
 
 
-def test_astm_without_azimuth_of_the_light(reading):
-    data = reading("VARS theta_i,theta_s,phi_s,Integrated BRDF\n0.3,0.3,0,0.7\n")
-    np.testing.assert_allclose(data.wi * [-1, 1, 1], data.wo, atol=1e-15)
-    assert data.channels == ("value",)
-
-
-def test_many_numbers_of_astm(tmp_path):
-    numbers = np.random.default_rng(0).random((20_000, 7))
-    np.savetxt(tmp_path / "big.astm", numbers, "%.6f", ",", header=ASTM.strip(), comments="")
-    np.testing.assert_allclose(read(tmp_path / "big.astm").values, numbers[:, 4:].round(6))
-
-
 PAB = """#sample_name "a sample"
 #incident_angle 82.5 180
 #format: theta phi DSF
@@ -61,15 +49,6 @@ def test_pab_as_in_the_manual_of_radiance(reading):
     same = reading(apart)
     np.testing.assert_array_equal(same.values, data.values)
     assert "up is at phi 90" in same.source.notes[-1]
-
-
-def test_pab_with_colours_of_a_btdf(reading):
-    data = reading("#format: theta phi BTDF\n#incident_angle 20 0\n#colorimetry: CIE-XYZ\n150 180 1 2 3\n90 0 1 1 1\n")
-    assert data.channels == ("X", "Y", "Z")
-    np.testing.assert_array_equal(data.values[0], [1, 2, 3])
-    assert data.wo[0, 2] < 0
-    np.testing.assert_array_equal(data.mask, [True, False])
-    assert "1 sample below zero, kept as measured" in reading(PAB.replace("0.009744", "-0.01")).source.notes
 
 
 HEAD = """LightTools BSDF

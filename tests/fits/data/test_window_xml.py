@@ -85,13 +85,6 @@ def test_nodes_of_equal_grids_become_one():
     assert twice[2, 1, 3] == 10 * 5 + 3  # node: first and last axis above the middle, 1 + 4; in it 0, 1, 1
 
 
-def test_a_million_values_in_seconds():
-    node = "{" + f"{{{' '.join(['0.123456'] * 16)}}} " * 16 + "}"
-    for _ in range(3):
-        node = "{" + node * 16 + "}"
-    assert boxes(parse(node, 4), 4).values.size == 16**5
-
-
 def test_the_disk_has_the_area_of_the_square():
     """Points on concentric squares land on concentric circles; the map keeps areas."""
     u, v = np.random.default_rng(0).random((2, 2000))
