@@ -1,6 +1,5 @@
 """Commands on a material: simulate measurements of it, draw it, write it for renderers."""
 
-import tomllib
 from argparse import Namespace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,7 +16,7 @@ if TYPE_CHECKING:
 
 
 def simulate(arguments: Namespace) -> int:
-    """Write simulated measurements of a stack; names what of its file is not simulated: noise, scale, instrument."""
+    """Write simulated measurements of a stack; noise, scale and instrument of its file are not simulated."""
     require_free_place(arguments.out, arguments.force, ".csv", "measurements")
     use_jax()
     from fits.data.geometry import slices
@@ -29,13 +28,7 @@ def simulate(arguments: Namespace) -> int:
     data = run_simulation(
         _at_start(given.stack), geometry, transport=given.transport, noise=arguments.noise, seed=arguments.seed
     )
-    ignored = [f"[{name}]" for name in ("noise", "scale", "instrument") if name in tomllib.loads(given.text)]
-    if not ignored:
-        return write_measurements(data, arguments)
-    note = f"not simulated: {', '.join(ignored)} of {arguments.stack}"
-    write_measurements(data.noted(note), arguments)
-    print(f"{note[0].upper()}{note[1:]}")
-    return DONE
+    return write_measurements(data, arguments)
 
 
 def write_measurements(data: Measurements, arguments: Namespace) -> int:

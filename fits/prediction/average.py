@@ -37,21 +37,16 @@ class Average:
             for number, (name, count) in enumerate(zip(self.weights, counts, strict=True))
             if count > 0
         ]
-        first = parts[0]
-        if any(part.degrees_of_freedom != first.degrees_of_freedom for part in parts):
+        if len({part.degrees_of_freedom for part in parts}) > 1:
             raise ValueError("average: the fits differ in the tails of their noise")
-        means, scales, softness = (np.concatenate(same) for same in zip(*map(_logarithmic, parts), strict=True))
-        discrepancy_sd = None
-        if any(part.discrepancy_sd is not None for part in parts):
-            sds = [np.zeros_like(part.means) if part.discrepancy_sd is None else part.discrepancy_sd for part in parts]
-            discrepancy_sd = np.concatenate(sds)
+        means, scales, softness, sds = (np.concatenate(same) for same in zip(*map(_logarithmic, parts), strict=True))
         return replace(
-            first,
+            parts[0],
             values=np.concatenate([part.values for part in parts]),
             means=means,
             scales=scales,
             softness=softness,
-            discrepancy_sd=discrepancy_sd,
+            discrepancy_sd=None if all(part.discrepancy_sd is None for part in parts) else sds,
             seed=seed,
             pareto_k=float(np.fmax.reduce([part.pareto_k for part in parts])),
             effective_draws=sum(part.effective_draws for part in parts),
@@ -95,9 +90,10 @@ def average(
     return Average(dict(candidates), {name: weights[name] / total for name in candidates})
 
 
-def _logarithmic(part: Prediction) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Means, scales and softness, (D, M, C) each, of a measurement's `logarithm`."""
+def _logarithmic(part: Prediction) -> tuple[np.ndarray, ...]:
+    """Means, scales, softness and standard deviations of the discrepancy, (D, M, C) each, of the `logarithm`."""
+    sd = np.zeros_like(part.means) if part.discrepancy_sd is None else part.discrepancy_sd
     if part.softness is not None:
-        return part.means, part.scales, np.broadcast_to(part.softness, part.means.shape)
+        return part.means, part.scales, np.broadcast_to(part.softness, part.means.shape), sd
     softness = np.full(part.means.shape, LINEAR * float(np.max(np.abs(part.means)) or 1.0))
-    return part.means / softness, part.scales / softness, softness
+    return part.means / softness, part.scales / softness, softness, sd

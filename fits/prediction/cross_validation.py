@@ -140,9 +140,7 @@ def _held_out(
     proposal: "Density | None",
 ) -> dict[str, Any]:
     """Log predictive density of these measurements by a fit without them, its error, and whether that converged."""
-    held_out = np.zeros(len(data), bool)
-    held_out[rows] = True
-    rest = refit(without(fit.problem, held_out), *starts)
+    rest = refit(without(fit.problem, np.isin(np.arange(len(data)), rows)), *starts)
     each, effective, error = np.empty((0, *data.values[rows].shape)), 0.0, math.inf
     while not len(each) or (error > options.monte_carlo_error and len(each) < options.most_draws):
         prediction = posterior_predictive(rest, data, draws=draws, seed=seed + len(each), proposal=proposal)
@@ -216,8 +214,7 @@ class ModelScore:
     elpd: sum of log predictive densities of measurements, each by a fit without its incidence. elpd_diff: how far it is
     below the best; dse: standard error of the difference, by the incidences and by the draws of the posterior.
     least_diff: the difference a measurement, of the incidence where that is least. clear_diff: the difference less its
-    error (see `ComparisonOptions`). weight:
-    of stacking (Yao, Vehtari, Simpson & Gelman 2018, Bayesian Anal. 13, 917). evidence: see `evidence`.
+    error (see `ComparisonOptions`). weight: of stacking (Yao, Vehtari, Simpson & Gelman 2018, Bayesian Anal. 13, 917).
     model_probability: of this stack among those compared, equally probable a priori.
     """
 
@@ -240,15 +237,10 @@ def model_scores(
     candidates: Mapping[str, Fit], progress: Progress | None = None, options: ComparisonOptions | None = None
 ) -> dict[str, ModelScore]:
     """Score fits of the same data, by name; each is fitted again without each incidence (see `cross_validate`)."""
-    results = {
-        name: out_of_sample(fit, named(name, given_progress(progress)), options=options)
-        for name, fit in candidates.items()
-    }
-    return rank_models(
-        {name: held_out for name, (held_out, _) in results.items()},
-        {name: evidence for name, (_, evidence) in results.items()},
-        options,
-    )
+    held_out, evidences = {}, {}
+    for name, fit in candidates.items():
+        held_out[name], evidences[name] = out_of_sample(fit, named(name, given_progress(progress)), options=options)
+    return rank_models(held_out, evidences, options)
 
 
 def out_of_sample(

@@ -89,47 +89,39 @@ def importance_draws(
         Jacobians. Otherwise they are used if neither approximations about the minima nor `proposal` suffice.
     proposal: an approximation of a posterior similar to the fit's.
     """
-    pool = _Pool(fit, draws, generator)
-    weighted = pool.add(initial_mixture(fit, BATCH, along_ridges=along_ridge))
-    if not along_ridge and not weighted.suffices(MAX_PARETO_K):
-        if proposal is not None:
-            weighted = pool.adapt(pool.add(proposal), max_pareto_k)
-        if not weighted.suffices(MAX_PARETO_K):
-            weighted = pool.add(initial_mixture(fit, BATCH))
-    return pool.adapt(weighted, max_pareto_k)
+    proposals: list[Density] = []
+    positions, log_posterior = np.empty((0, len(fit.vector))), np.empty(0)
 
-
-class _Pool:
-    """Draws of several proposals, weighted as those of their mixture."""
-
-    def __init__(self, fit: Fit, draws: int, generator: np.random.RandomState):
-        self.fit, self.draws, self.generator = fit, draws, generator
-        self.proposals: list[Density] = []
-        self.positions = np.empty((0, len(fit.vector)))
-        self.log_posterior = np.empty(0)
-
-    def add(self, proposal: Density) -> ImportanceDraws:
-        """Add draws of a proposal; returns all draws of the pool."""
-        positions = proposal.draw(self.generator, self.draws)
-        log_posterior = log_posteriors(self.fit.problem, positions, BATCH)
-        self.proposals.append(proposal)
-        self.positions = np.concatenate([self.positions, positions])
-        self.log_posterior = np.append(self.log_posterior, log_posterior)
-        densities = [one.log_density(self.positions) for one in self.proposals]
-        weights = self.log_posterior - (logsumexp(densities, axis=0) - np.log(len(densities)))
+    def add(proposal: Density) -> ImportanceDraws:
+        """Draws of all proposals with this one, weighted as those of their mixture."""
+        nonlocal positions, log_posterior
+        new = proposal.draw(generator, draws)
+        proposals.append(proposal)
+        positions = np.concatenate([positions, new])
+        log_posterior = np.append(log_posterior, log_posteriors(fit.problem, new, BATCH))
+        densities = [one.log_density(positions) for one in proposals]
+        weights = log_posterior - (logsumexp(densities, axis=0) - np.log(len(densities)))
         weights = np.where(np.isfinite(weights), weights, -np.inf)
         if not np.isfinite(weights).any():
-            return ImportanceDraws(self.positions, weights, np.inf)
-        return ImportanceDraws(self.positions, weights, _pareto_k(np.maximum(weights - weights.max(), -700.0)))
+            return ImportanceDraws(positions, weights, np.inf)
+        return ImportanceDraws(positions, weights, _pareto_k(np.maximum(weights - weights.max(), -700.0)))
 
-    def adapt(self, weighted: ImportanceDraws, max_pareto_k: float) -> ImportanceDraws:
-        """Add draws of mixtures fitted to the weighted ones until they suffice."""
+    def adapt(weighted: ImportanceDraws) -> ImportanceDraws:
+        """With draws of mixtures fitted to the weighted ones, until they suffice."""
         for _ in range(ROUNDS):
             if weighted.suffices(max_pareto_k) or not np.isfinite(weighted.log_weights).any():
                 break
-            rows = _resample(_tempered(weighted.log_weights), self.generator, self.draws)
-            weighted = self.add(FittedProposal.to(weighted.positions[rows], self.generator))
+            rows = _resample(_tempered(weighted.log_weights), generator, draws)
+            weighted = add(FittedProposal.to(weighted.positions[rows], generator))
         return weighted
+
+    weighted = add(initial_mixture(fit, BATCH, along_ridges=along_ridge))
+    if not along_ridge and not weighted.suffices(MAX_PARETO_K):
+        if proposal is not None:
+            weighted = adapt(add(proposal))
+        if not weighted.suffices(MAX_PARETO_K):
+            weighted = add(initial_mixture(fit, BATCH))
+    return adapt(weighted)
 
 
 def _pareto_k(log_weights: Floats) -> float:

@@ -9,7 +9,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
@@ -36,6 +36,7 @@ from layerjax._checks import in_short, require_count, require_kind, require_numb
 from layerjax.compiling import programs_kept
 
 if TYPE_CHECKING:
+    from fits.prediction.average import Average
     from fits.sampling.proposals import Density
 
 LEVELS = (0.025, 0.25, 0.5, 0.75, 0.975)
@@ -234,9 +235,8 @@ def scores(prediction: Prediction, measurements: Measurements, rows: NDArray[np.
     require_kind("prediction", prediction, Prediction)
     require_kind("measurements", measurements, Measurements, fix=TO_HAVE_THEM)
     used = measurements.used()
-    if used.wi.shape != prediction.wi.shape or not np.allclose(used.wo, prediction.wo) & np.allclose(
-        used.wi, prediction.wi
-    ):
+    directions = (used.wi, prediction.wi), (used.wo, prediction.wo)
+    if not all(len(own) == len(theirs) and np.allclose(own, theirs) for own, theirs in directions):
         raise ValueError("scores: the measurements have other directions than the prediction")
     chosen = np.ones(len(used), bool) if rows is None else rows
     if not chosen.any():
@@ -255,15 +255,9 @@ def scores(prediction: Prediction, measurements: Measurements, rows: NDArray[np.
     )
 
 
-class Predictor(Protocol):
-    """Several fits that predict as one: see `fits.average`."""
-
-    def predict(self, at: Geometry | Measurements, *, draws: int, seed: int) -> Prediction: ...
-
-
 @programs_kept()
 def predict(
-    fitted: Fit | Posterior | Predictor,
+    fitted: "Fit | Posterior | Average",
     at: Geometry | Measurements,
     *,
     draws: int = DRAWS,

@@ -100,8 +100,6 @@ class FitReport:
                 corner = parameters.corner_picture(self.estimates)
                 sampling.append(tables.posterior_table(self.estimates))
                 sampling.append(_picture(corner, "Samples of the posterior; orange: the best fit."))
-            caption = "Every walker; estimates use the steps right of the orange line."
-            sampling.append(_picture(parameters.trace_picture(self.posterior), caption))
 
         residuals = [
             *(one.sentence for one in verdicts.statements(facts)["residuals"]),

@@ -26,7 +26,6 @@ if TYPE_CHECKING:
 
 INK, GREY = "#222222", "#9a9a9a"
 CYCLE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
-NAMED = {"red": "#D55E00", "green": "#009E73", "blue": "#0072B2"}
 ANGLE_LABEL = "viewing angle θₒ, degrees (+ forward, $-$ backward)"
 LOG_ABOVE = 10.0  # ratio of the largest to the smallest value from which an axis is logarithmic
 MOST_CHANNELS, MOST_INCIDENCES = 6, 9  # in one picture, evenly spaced among all
@@ -76,7 +75,7 @@ def data_picture(data: "Measurements") -> Figure:
                 for incidence, colour in zip(shown, ordered_colours(len(shown)), strict=True):
                     rows = incidence.rows[flat[incidence.rows]]
                     draw_points(axes, data, rows[used[rows]], channel, colour, incidence.label, data.sigma)
-                    draw_points(axes, data, rows[~used[rows]], channel, GREY, None, None)
+                    draw_points(axes, data, rows[~used[rows]], channel, GREY)
                 value_axis(axes, data.values[flat], value_label(data, channel))
             if panels[0].get_legend_handles_labels()[0]:
                 panels[0].legend(loc="best", ncols=2 if len(shown) > 4 else 1)
@@ -162,7 +161,7 @@ def ordered_colours(count: int) -> list[str]:
 
 def channel_colour(channel: str, index: int) -> str:
     """The channel's own colour for red, green and blue, otherwise the next of the cycle."""
-    return NAMED.get(channel, CYCLE[index % len(CYCLE)])
+    return {"red": CYCLE[1], "green": CYCLE[2], "blue": CYCLE[0]}.get(channel, CYCLE[index % len(CYCLE)])
 
 
 def draw_points(
@@ -171,25 +170,16 @@ def draw_points(
     rows: np.ndarray,
     channel: int,
     colour: str,
-    label: str | None,
-    sigma: np.ndarray | None,
+    label: str | None = None,
+    sigma: np.ndarray | None = None,
 ) -> None:
     """Values of `rows` against the signed angle, with error bars from `sigma` (N, C); nothing when `rows` is empty."""
     if not rows.size:
         return
-    axes.errorbar(
-        signed_angle(data)[rows],
-        data.values[rows, channel],
-        yerr=None if sigma is None else np.nan_to_num(sigma[rows, channel]),
-        fmt="o",
-        markersize=2.5 if len(rows) > 60 else 3.5,
-        color=colour,
-        markeredgewidth=0.0,
-        elinewidth=0.6,
-        ecolor=mpl.colors.to_rgba(colour, 0.35),
-        label=label,
-        zorder=2,
-    )
+    errors = None if sigma is None else np.nan_to_num(sigma[rows, channel])
+    style: dict[str, Any] = {"fmt": "o", "markersize": 2.5 if len(rows) > 60 else 3.5, "markeredgewidth": 0.0}
+    style |= {"color": colour, "elinewidth": 0.6, "ecolor": mpl.colors.to_rgba(colour, 0.35), "zorder": 2}
+    axes.errorbar(signed_angle(data)[rows], data.values[rows, channel], errors, label=label, **style)
 
 
 def is_logarithmic(values: np.ndarray) -> bool:

@@ -149,7 +149,7 @@ def _points(axes: Axes, fit: "Fit", rows: np.ndarray, coloured: bool) -> None:
         colour = channel_colour(name, channel) if coloured else INK
         label = f"{what}, {name}" if len(data.channels) > 1 else what
         draw_points(axes, data, rows[used], channel, colour, label, sigma)
-        draw_points(axes, data, rows[~used], channel, GREY, None if channel else "not used", None)
+        draw_points(axes, data, rows[~used], channel, GREY, None if channel else "not used")
 
 
 def _line(axes: Axes, curve: _Curve, channel: int, colour: str, label: str | None, place: int) -> None:

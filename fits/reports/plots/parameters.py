@@ -1,4 +1,4 @@
-"""Pictures of parameters: their posterior (corner and trace), and their correlations."""
+"""Pictures of parameters: their posterior, every pair of them, and their correlations."""
 
 from typing import TYPE_CHECKING
 
@@ -39,21 +39,6 @@ def corner_picture(posterior: "Posterior") -> Figure:
             fig=figure,
             quiet=bool(posterior.modes),  # of modes narrower than a bin there are no contours
         )
-    return figure
-
-
-def trace_picture(posterior: "Posterior") -> Figure:
-    """Every walker against the step, one panel per parameter; what is left of the line was discarded as burn-in."""
-    chain = np.asarray(posterior.chain)
-    every = max(1, len(chain) // 1000)
-    with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(9.5, 1.3 * len(posterior.names) + 0.5), layout="constrained")
-        panels = figure.subplots(len(posterior.names), 1, sharex=True, squeeze=False)[:, 0]
-        for index, (axes, name) in enumerate(zip(panels, posterior.names, strict=True)):
-            axes.plot(np.arange(len(chain))[::every], chain[::every, :, index], color=INK, linewidth=0.3, alpha=0.3)
-            axes.axvline(posterior.burn_in, color=CYCLE[1], linewidth=1.2)
-            axes.set_title(f"{name}, autocorrelation time {posterior.autocorrelation_time[index]:.0f} steps")
-        panels[-1].set_xlabel("step (used from the line on)")
     return figure
 
 

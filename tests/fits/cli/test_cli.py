@@ -90,7 +90,7 @@ def test_sampling_resumes_until_it_is_enough(work, capsys, coat_fit, monkeypatch
         assert abs(entry["mean"] - coat_fit.values[name]) < coat_fit.standard_errors[name]
         assert entry["low_68"] < entry["median"] < entry["high_68"]
     pictures = (work / "result" / "report.html").read_text().count("data:image/png")
-    assert pictures == 5  # curves, maps, correlation, corner, trace
+    assert pictures == 4  # curves, maps, correlation, corner
     with monkeypatch.context() as patch:
         patch.setattr(FitReport, "write", lambda *_: None)
         assert main(["sample", "result", "--ess", "1000000", "--max-steps", str(len(longer.chain))]) == 1
@@ -185,14 +185,6 @@ def test_convert_and_simulate_write_csv(work, capsys, coat_data):
     assert sorted(set(first.theta_i)) == [20.0, 40.0]
     # Lambertian paint alone would be albedo / pi = 0.159; the coat's start values darken it
     assert 0.02 < float(np.median(first.values)) < 0.16
-
-    more = "\n[noise]\nrelative = 0.1\n[instrument]\ndetector_aperture = 2.0\n"
-    (work / "noisy.toml").write_text((work / "coat.toml").read_text() + more)
-    for name in ("coat", "noisy"):
-        assert main(["simulate", "--stack", f"{name}.toml", "--out", f"{name}.csv"]) == 0
-    assert capsys.readouterr().out.splitlines()[-1] == "Not simulated: [noise], [instrument] of noisy.toml"
-    np.testing.assert_array_equal(read("noisy.csv").values, read("coat.csv").values)
-    assert "not simulated: [noise], [instrument] of noisy.toml" in read("noisy.csv").source.notes
 
 
 # ---- the command itself ----

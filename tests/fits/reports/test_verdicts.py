@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from fits.data.geometry import Geometry, slices
+from fits.data.geometry import slices
 from fits.data.scans import correlation, neighbours, signed_angle
 from fits.optimise.fit import fit
 from fits.optimise.result import Fit
@@ -175,38 +175,15 @@ def test_both_curves_are_drawn_and_the_residuals_are_those_of_the_one_with_the_d
     np.testing.assert_allclose(np.asarray(points.get_ydata()), (values - drawn) / (0.02 * values), atol=0.15)
 
 
-ADDED = "Noise: the data's own sigma and `relative` are added in quadrature."
-
-
-@pytest.mark.parametrize(
-    ("noise", "sigma", "words"),
-    [
-        (Noise(), None, "No noise is stated: 5 % of the model's value is assumed."),
-        (Noise(relative=0.05), None, None),
-        (Noise(floor=0.01), None, None),
-        (Noise(relative=0.03), 0.04, ADDED),
-        (Noise(), 0.04, None),
-        (Noise(relative=0.03, use_sigma=False), 0.04, None),
-        (Noise(relative=0.0), 0.04, None),
-    ],
-)
-def test_noise_that_is_assumed_or_added_is_announced(noise: Noise, sigma: float | None, words: str | None) -> None:
-    problem = Problem(STACK, along(GEOMETRY, 1.0, sigma), line, noise)
-    assert [sentence.startswith(words or "?") for sentence in verdicts.noise_statements(problem)] == [True] * bool(
-        words
-    )
-    assert ("(assumed)" in tables.noise_in_words(problem)) == (words is not None and "assumed" in words)
-
-
-def test_repeated_measurements_offer_a_noise() -> None:
-    twice = Geometry(*(np.tile(w, (2, 1)) for w in (GEOMETRY.wi, GEOMETRY.wo)))
-    scattered = 1.0 + 0.0017 * np.random.default_rng(0).standard_normal((len(twice), 1))
-    (words,) = verdicts.noise_statements(Problem(STACK, along(twice, scattered), line, Noise()))
-    match = re.search(r"repeated measurements scatter by about ([\d.]+) %: `relative = ([\d.]+)`", words)
-    assert match is not None
-    # the median of 164 differences: 8 % of itself
-    assert float(match[1]) == pytest.approx(0.17, rel=0.3)
-    assert float(match[2]) == pytest.approx(0.0017, rel=0.3)
+def test_noise_that_is_assumed_is_announced(coat_fit: Fit) -> None:
+    (words,) = verdicts.statements(replace(assess(coat_fit), noise_assumed=True))["remarks"]
+    assert words.sentence.startswith("No noise is stated: 5 % of the model's value is assumed.")
+    for noise, sigma, said in (
+        (Noise(), None, "0.05 of the model's value (assumed), "),
+        (Noise(relative=0.03), 0.04, "the file's own sigma, 0.03 of the model's value, "),
+        (Noise(relative=0.03, use_sigma=False, tails="student"), 0.04, "0.03 of the model's value, "),
+    ):
+        assert tables.noise_in_words(Problem(STACK, along(GEOMETRY, 1.0, sigma), line, noise)).startswith(said)
 
 
 FIRST, SECOND = "layers[0].thickness", "base.albedo"
