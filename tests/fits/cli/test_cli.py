@@ -21,7 +21,6 @@ from fits.data.reading import read
 from fits.engines import run
 from fits.problem.problem import Problem
 from fits.reports.html import FitReport
-from fits.reports.plots.data import MOST_CHANNELS, data_picture
 from fits.reports.results import load_fit, load_posterior, save_fit
 from tests.helpers import tasks
 from tests.helpers.coats import make_folder
@@ -166,17 +165,15 @@ def test_info_says_what_is_there_and_draws_it(work, capsys, monkeypatch):
     assert (work / "data.png").read_bytes() == b"precious"
 
     names = ",".join(f"brdf_{k}" for k in range(400))
-    rows = [f"30,{theta}," + ",".join(map(str, np.linspace(1.0, 2.0, 400))) for theta in range(-60, 61, 10)]
+    rows = [f"30,{theta}," + ",".join(["1"] * 399 + ["2"]) for theta in range(-60, 61, 10)]
     (work / "spectral.csv").write_text("\n".join([f"theta_i,theta_o,{names}", *rows]))
-    capsys.readouterr()
     assert main(["info", "spectral.csv"]) == 0
     output = capsys.readouterr().out
     assert "0, 1, 2, ..., 399 (400 in all)" in output
     assert "1 to 2" in output
-    assert len(data_picture(read("spectral.csv")).subfigs[0].axes) == MOST_CHANNELS
 
 
-def test_convert_and_simulate_write_csv(work, capsys, coat_data):
+def test_convert_and_simulate_write_csv(work, coat_data):
     assert main(["convert", "data.csv", "copy.csv"]) == 0
     np.testing.assert_array_equal(read(work / "copy.csv").values, coat_data.values)
     words = ["simulate", "--stack", "coat.toml", "--incidence", "20", "40", "--noise", "0.1", "--out", "new.csv"]
@@ -190,21 +187,22 @@ def test_convert_and_simulate_write_csv(work, capsys, coat_data):
 # ---- the command itself ----
 
 
-def test_help_imports_no_jax():
-    script = "import sys; from fits.cli import main\ntry: main(['--help'])\nfinally: assert 'jax' not in sys.modules"
-    done = subprocess.run([sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    assert "simulate" in done.stdout
+HELP = """
+import contextlib, sys
+from fits.cli import main
+from fits.cli.arguments import COMMANDS
+for words in ([], *([name] for name in COMMANDS)):
+    with contextlib.suppress(SystemExit):
+        main([*words, "--help"])
+assert "jax" not in sys.modules
+"""
 
 
-@pytest.mark.parametrize("command", COMMANDS)
-def test_every_command_has_its_help(command: str, capsys: pytest.CaptureFixture[str]) -> None:
-    """Eleven of them had a traceback instead."""
-    with pytest.raises(SystemExit) as stop:
-        main([command, "--help"])
-    assert stop.value.code == 0
-    words, one = capsys.readouterr().out, COMMANDS[command]
-    assert all(option in words for option in (*one.particular, *one.shared.split()) if option.startswith("--"))
+def test_every_command_has_its_help_without_jax() -> None:
+    done = subprocess.run([sys.executable, "-c", HELP], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+    flags = [flag for one in COMMANDS.values() for flag in (*one.particular, *one.shared.split())]
+    assert all(flag in done.stdout for flag in flags)
 
 
 def test_a_warning_for_users_is_one_line_and_shown_once(capsys, monkeypatch):

@@ -1,6 +1,7 @@
 """Bad input and bad usage of `layerjax`: one line on stderr, exit code 2, and nothing written."""
 
 import shutil
+from unittest.mock import Mock
 
 import jax
 import pytest
@@ -107,23 +108,19 @@ def test_a_cluster_that_is_not_there_is_named(work, capsys):
     assert "tcp://127.0.0.1:9: there is no scheduler" in capsys.readouterr().err.splitlines()[-1]
 
 
-MACHINE = {
-    "memory": (MemoryError("Unable to allocate 74.5 GiB"), "memory is not enough: Unable to allocate 74.5 GiB"),
-    "memory without a message": (MemoryError(), "memory is not enough: MemoryError"),
-    "JAX's memory": (
-        jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory\nallocating 9 bytes."),
-        "memory is not enough: RESOURCE_EXHAUSTED: Out of memory allocating 9 bytes.",
-    ),
-    "size": (OverflowError("cannot convert float infinity to integer"), "a number is too large: cannot convert"),
-}
-
-
-@pytest.mark.parametrize(("error", "fragment"), MACHINE.values(), ids=MACHINE)
+@pytest.mark.parametrize(
+    ("error", "fragment"),
+    [
+        (MemoryError(), "memory is not enough: MemoryError"),
+        (
+            jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of\nmemory"),
+            "not enough: RESOURCE_EXHAUSTED: Out of memory",
+        ),
+        (OverflowError("cannot convert float infinity to integer"), "a number is too large: cannot convert"),
+    ],
+)
 def test_errors_of_the_machine(work, capsys, monkeypatch, error, fragment):
-    def fails(_):
-        raise error
-
-    monkeypatch.setitem(COMMANDS, "info", fails)
+    monkeypatch.setitem(COMMANDS, "info", Mock(side_effect=error))
     assert fragment in refused(["info", "data.csv"], capsys, work)
 
 
