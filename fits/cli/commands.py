@@ -24,8 +24,6 @@ if TYPE_CHECKING:
     from fits.optimise.result import Fit
     from fits.sampling.posterior import Posterior
 
-DRAWING = "pictures and report"
-
 # ---- a fit and what follows from it ----
 
 
@@ -42,12 +40,12 @@ def fit(arguments: Namespace) -> int:
     data, held_out = read_options(arguments).split(arguments.data)
     for doubt in doubtful_angles(data):
         warnings.warn(doubt, stacklevel=1)
-    given, how = read_problem(arguments.stack), {"starts": arguments.starts, "seed": arguments.seed}
+    given, how = read_problem(arguments.stack), {"starts": arguments.starts, "seed": arguments.seed, "force": force}
     resume = f"{directory} was not written; the same command resumes with the starts that are done"
     with show_progress() as progress, hint(resume):
-        whole = fit_file(directory, given, data, held_out, **how, force=force, progress=progress)
-    words = verdicts.summary(whole.fit)
-    show(tables.parameter_table(whole.fit), *words, f"Report: {directory / results.REPORT}")
+        whole = fit_file(directory, given, data, held_out, **how, progress=progress)
+    report = f"Report: {directory / results.REPORT}"
+    show(tables.parameter_table(whole.fit), *verdicts.summary(whole.fit), report)
     if held_out is not None and whole.predicted is not None:
         show(tables.scores_table(whole.predicted, held_out, "Held-out data"))
     return DONE if whole.fit.converged else DOUBTFUL
@@ -74,16 +72,13 @@ def sample(arguments: Namespace) -> int:
     settings |= {"sampler": arguments.sampler or sampler, "walkers": arguments.walkers or walkers}
     with show_progress() as progress, hint(f"the chain is kept, `layerjax sample {directory}` resumes it"):
         posterior = run_sampler(result, **settings, path=chain, resume=not arguments.force, progress=progress)
-        progress(DRAWING, 0, 1)
         if verdicts.reportable(posterior):
             results.save_posterior(posterior, directory)
+            show(tables.posterior_table(posterior))
         else:
             (directory / results.SUMMARY).unlink(missing_ok=True)
         name, held_out = directory.resolve().name, results.load_held_out(directory)
         FitReport(result, posterior, name=name, held_out=held_out).write(directory)
-        progress(DRAWING, 1, 1)
-    if verdicts.reportable(posterior):
-        show(tables.posterior_table(posterior))
     show(*verdicts.sampled(posterior), f"Report: {directory / results.REPORT}")
     enough = posterior.converged and np.min(posterior.effective_samples) >= posterior.options.ess
     if not enough:
@@ -136,14 +131,11 @@ def report(arguments: Namespace) -> int:
     if out is None and not os.access(directory, os.W_OK):
         raise ValueError(f"{directory}: cannot be written to (--out FILE writes the report elsewhere)")
     others = _candidates(arguments.compare, arguments.directory)
-    with show_progress() as progress:
-        progress(DRAWING, 0, 1)
-        whole = FitReport(result, posterior, others, arguments.directory, results.load_held_out(directory))
-        if out is None:
-            whole.write(directory)
-        else:
-            write_text(out, whole.page(), force=arguments.force)
-        progress(DRAWING, 1, 1)
+    whole = FitReport(result, posterior, others, arguments.directory, results.load_held_out(directory))
+    if out is None:
+        whole.write(directory)
+    else:
+        write_text(out, whole.page(), force=arguments.force)
     print(f"Report: {out or directory / results.REPORT}")
     return DONE
 

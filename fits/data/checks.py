@@ -12,14 +12,9 @@ from scipy.spatial import Delaunay, QhullError, cKDTree
 from fits.data.measurements import Measurements
 from fits.data.scans import AT_NORMAL, SAME_ANGLE, in_plane, incidences, relative_azimuth, scans, signed_angle
 
-SAME_PLACE = 0.05
-"""Degrees within which two measurements are repeats of one."""
-
-LEAST_COVERED = 0.5
-"""Share of the projected hemisphere that must be covered for an integral over it."""
-
-STEEP = 5.0
-"""Polar angle of the light, in degrees, from which forward and backward are distinguished."""
+SAME_PLACE = 0.05  # degrees within which two measurements are repeats of one
+LEAST_COVERED = 0.5  # share of the projected hemisphere that must be covered for an integral over it
+STEEP = 5.0  # polar angle of the light, in degrees, from which forward and backward are distinguished
 
 
 class Agreement(NamedTuple):

@@ -35,14 +35,9 @@ from layerjax.compiling import programs_kept
 if TYPE_CHECKING:
     from fits.sampling.proposals import Density
 
-DRAWS = 128
-"""Draws of the posterior that held-out data are predicted with at a time, see `ComparisonOptions`."""
-
-INFINITE_NOISE = 1e8
-"""Noise with which a measurement does not influence a fit, in units of the largest measurement."""
-
-STACKING_STEPS = 20_000
-"""Steps of the expectation maximisation of stacking weights, at most."""
+DRAWS = 128  # draws of the posterior that held-out data are predicted with at a time, see `ComparisonOptions`
+INFINITE_NOISE = 1e8  # noise with which a measurement does not influence a fit, in units of the largest measurement
+STACKING_STEPS = 20_000  # steps of the expectation maximisation of stacking weights, at most
 
 Checkpoint = Callable[[str, Callable[[], Any]], Any]
 """Gives the record of this name: what the call computes, or what an earlier run has kept of it."""

@@ -22,8 +22,8 @@ from fits.sampling.proposals import Density, FittedProposal
 from layerjax._checks import require_count, require_kind, require_seed
 from layerjax._numerics import broadcasting
 
+# pareto k above which a part of the posterior may be missing; below it the draws suffice
 MAX_PARETO_K = ComparisonOptions().max_pareto_k
-"""Pareto k above which a part of the posterior may be missing; below it the draws suffice."""
 
 FINITE_VARIANCE, ROUNDS = 0.5, 3
 """Pareto k below which the variance of weights is finite, and how many mixtures are fitted to reach it."""
@@ -32,11 +32,8 @@ MIN_EFFECTIVE_DRAWS = 50
 """Effective sample size below which another proposal is tried, and to which weights are tempered before a mixture is
 fitted to them."""
 
-DRAWS = 1000
-"""Draws of each proposal for an evidence."""
-
-BATCH = 50
-"""Draws that a core evaluates at a time: however many there are, one program serves."""
+DRAWS = 1000  # draws of each proposal for an evidence
+BATCH = 50  # draws that a core evaluates at a time: however many there are, one program serves
 
 
 @dataclass(frozen=True, eq=False)

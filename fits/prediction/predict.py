@@ -42,23 +42,14 @@ if TYPE_CHECKING:
 LEVELS = (0.025, 0.25, 0.5, 0.75, 0.975)
 """Quantiles of a `Summary`: the ends of the central 50 % and 95 % intervals, and the median."""
 
-COVERAGES = (0.5, 0.95)
-"""Central intervals whose coverage is scored."""
+COVERAGES = (0.5, 0.95)  # central intervals whose coverage is scored
+DRAWS = 256  # draws of the posterior that a prediction is made with
+MIN_PROPOSALS = 400  # the fewest weighted draws that those of a fit's posterior are resampled from
+DRAWS_PER_VECTOR = 8  # values that are drawn of the distribution of each draw of the posterior, for means and quantiles
+BISECTIONS = 50  # halvings of the interval that a quantile of the mixture lies in
 
-DRAWS = 256
-"""Draws of the posterior that a prediction is made with."""
-
-MIN_PROPOSALS = 400
-"""The fewest weighted draws that those of a fit's posterior are resampled from."""
-
-DRAWS_PER_VECTOR = 8
-"""Values that are drawn of the distribution of each draw of the posterior, for means and quantiles."""
-
-BISECTIONS = 50
-"""Halvings of the interval that a quantile of the mixture lies in."""
-
+# the least standard deviation of the discrepancy, where the data determine it: its distribution keeps a density
 SMALLEST_SD = 1e-12
-"""The least standard deviation of the discrepancy, where the data determine it: its distribution keeps a density."""
 
 
 @dataclass(frozen=True, eq=False)
