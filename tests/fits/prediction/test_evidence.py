@@ -1,9 +1,7 @@
-"""The evidence of posteriors that are no ellipsoids, beside quadrature over the box, and beside dynesty."""
+"""The evidence of posteriors that are no ellipsoids, beside quadrature over the box."""
 
-import jax
 import numpy as np
 import pytest
-from scipy import stats
 from scipy.special import logsumexp
 
 from fits.data.geometry import slices
@@ -11,7 +9,7 @@ from fits.optimise.fit import fit
 from fits.optimise.result import Fit
 from fits.prediction.importance import evidence
 from fits.problem.noise import Noise
-from fits.problem.parameters import Free, Normal
+from fits.problem.parameters import Free
 from tests.helpers.models import along, line
 
 GEOMETRY = slices([10.0, 50.0], np.arange(-75.0, 76.0, 10.0))
@@ -54,32 +52,3 @@ def test_it_is_the_integral_over_the_box(name: str) -> None:
     assert estimate.reliable
     assert abs(estimate.log_evidence - exact) < 4.0 * estimate.error
     assert estimate.error < 0.1
-
-
-@pytest.mark.peers
-def test_it_is_that_of_nested_sampling() -> None:
-    dynesty = pytest.importorskip("dynesty")
-
-    def lobe(stack, wi, wo):
-        half = wi + wo
-        size = (half**2).sum(axis=-1)
-        return (stack["a"] + stack["b"] * (half[:, 2] ** 2 / size) ** (1.0 / stack["c"]))[:, None]
-
-    stack = {"a": Free(0.3, 0.0, 2.0, Normal(0.3, 0.3)), "b": Free(1.0, 0.0, 5.0), "c": Free(0.2, 0.01, 2.0)}
-    found = fitted(lobe, stack, {"a": 0.3, "b": 0.4, "c": 0.3}, starts=4)
-    problem = found.problem
-    likelihood = jax.jit(problem.log_likelihood)
-    prior = stats.truncnorm((0.0 - 0.3) / 0.3, (2.0 - 0.3) / 0.3, 0.3, 0.3)
-
-    def transform(unit: np.ndarray) -> np.ndarray:
-        return np.array([prior.ppf(unit[0]), *(problem.low[1:] + unit[1:] * (problem.high - problem.low)[1:])])
-
-    sampler = dynesty.NestedSampler(
-        lambda x: float(likelihood(x)), transform, 3, nlive=500, rstate=np.random.default_rng(0)
-    )
-    sampler.run_nested(print_progress=False, dlogz=0.05)
-    estimate = evidence(found)
-    assert estimate.reliable
-    error = np.hypot(estimate.error, sampler.results.logzerr[-1])
-    assert abs(estimate.log_evidence - sampler.results.logz[-1]) < 4.0 * error
-    assert error < 0.3

@@ -70,11 +70,12 @@ def test_intervals_of_a_line_are_those_of_regression(found: Fit) -> None:
         assert (UNRELIABLE in scores_table(one, found.problem.data, "").note) == unreliable
 
 
-@pytest.mark.parametrize("shared", [pytest.param(False, marks=pytest.mark.slow), True])
-def test_quantiles_are_those_of_the_draws(shared: bool) -> None:
+def test_quantiles_are_those_of_the_draws() -> None:
     fitted, held_out = split(measurements(3, 0.1))
-    at = predict(fitted_to(fitted, shared), held_out)
-    assert np.array_equal(at.mean, at.latent.mean) != shared
+    at = predict(fitted_to(fitted), held_out)
+    assert not np.array_equal(at.mean, at.latent.mean)
+    # a measurement adds independent noise: of the logarithm, which is the relative deviation here
+    np.testing.assert_allclose(at.scales**2, at.discrepancy_sd**2 + SIGMA**2, rtol=1e-3)
     # by 2,048 draws: the standard error of a quantile is at most 0.06 sd, at 4 or 5 of them
     for level, of_bsdf, of_measurement in zip(LEVELS, at.bsdf.quantiles, at.predictive.quantiles, strict=True):
         np.testing.assert_allclose(at.quantile(level), of_bsdf, atol=0.3 * at.sd.max())
@@ -105,28 +106,6 @@ def test_thirty_held_out_measurements_lie_within_what_is_predicted_and_not_withi
     assert inside(at.quantile(0.025), at.quantile(0.975)) >= 27
     assert inside(*at.predictive.quantiles[[0, -1]]) >= 27
     assert at.scores.coverage[0.95] >= 27 / 30
-
-
-@pytest.mark.slow
-def test_what_is_predicted_first_is_the_bsdf_and_not_the_stack_alone() -> None:
-    """The truth is known: a stack that is wrong by 10 %, smoothly in angle. Its intervals hold that, 95 of 100."""
-    inside: dict[str, list[float]] = {"bsdf": [], "latent": []}
-    closer = []
-    for seed in range(2):
-        fitted, _ = split(measurements(seed, 0.1))
-        _, truth = split(measurements(seed, 0.1, sigma=0.0))  # the discrepancy is drawn before the noise
-        at = predict(fitted_to(fitted), truth)
-        exact = truth.used().values
-        for name, held in inside.items():
-            interval = getattr(at, name)
-            held.append(float(np.mean((interval.quantiles[0] < exact) & (exact < interval.quantiles[-1]))))
-        # a measurement adds independent noise: of the logarithm, which is the relative deviation here
-        np.testing.assert_allclose(at.scales**2, at.discrepancy_sd**2 + SIGMA**2, rtol=1e-3)
-        closer.append(np.median(np.abs(at.mean / exact - 1.0)) / np.median(np.abs(at.latent.mean / exact - 1.0)))
-    # neighbours are correlated: 82 count as some ten, whose share scatters by 0.07, the mean of 2 by 0.05
-    assert np.mean(inside["bsdf"]) > 0.85
-    assert np.mean(inside["latent"]) < 0.7
-    assert np.mean(closer) < 0.9
 
 
 def test_directions_below_an_opaque_stack_are_refused(coat_fit: Fit) -> None:
