@@ -8,7 +8,6 @@ from scipy import special
 import layerjax as lj
 from fits.data.spheres import Shares, Sphere, Spheres
 from fits.data.totals import Totals
-from fits.optimise.fit import fit
 from fits.problem.parameters import Free
 from fits.problem.problem import Problem
 
@@ -69,21 +68,6 @@ def test_an_absorbing_slab_is_seen_by_diffuse_light_through_e3() -> None:
     passed = 2.0 * special.expn(3, depth)
     expected = spheres.measured(Shares(0.0, np.exp(-depth), 0.0, 0.0, passed, passed))
     np.testing.assert_allclose(np.ravel(problem.predict([depth])), expected, rtol=1e-4)
-
-
-@pytest.mark.slow
-def test_coefficients_are_recovered_through_spheres() -> None:
-    spheres = Spheres(FRONT, BEHIND, standard=0.98, together=True)
-    slab = lj.Stack([lj.TurbidMedium(1.0, Free(2.0, 0.1, 50.0), Free(0.5, 1e-3, 5.0), lj.HenyeyGreenstein(0.5))])
-    solver = lj.AddingDoubling(nodes=8, modes=1)
-
-    def totals(values: np.ndarray, seen: Spheres | None) -> Totals:
-        return Totals.of(0.0, reflectance=values[0], transmittance=values[1], sigma=0.001, spheres=seen)
-
-    exact = np.ravel(Problem(slab, totals(np.array([0.2, 0.3]), spheres), solver).predict([5.0, 0.2]))
-    found, blind = (fit(slab, totals(exact, seen), transport=solver, starts=2) for seen in (spheres, None))
-    np.testing.assert_allclose(list(found.values.values()), [5.0, 0.2], rtol=1e-4)
-    assert abs(blind.values["layers[0].mu_a"] / 0.2 - 1.0) > 0.05
 
 
 @pytest.mark.parametrize(
