@@ -33,20 +33,15 @@ def simulate(arguments: Namespace) -> int:
 
 def write_measurements(data: Measurements, arguments: Namespace) -> int:
     """Write them as csv, and print their number."""
-    from fits.data.formats import totals_csv
     from fits.data.formats.csv import write_csv
 
+    what, quantity = "measurements", "BRDF in 1/sr"
     if isinstance(data, Totals):
+        what, quantity = "totals", "shares of the incident flux"
         if data.spheres is not None:
-            raise ValueError(
-                f"{data.source.path}: integrating spheres measured these shares, which a CSV cannot describe; "
-                "`layerjax fit` takes the file as it is"
-            )
-        totals_csv.write(data, arguments.out, force=arguments.force)
-        print(f"{arguments.out}: {len(data)} totals, {len(data.channels)} channels, shares of the incident flux")
-        return DONE
+            raise ValueError(f"{data.source.path}: integrating spheres measured these, which a CSV cannot describe")
     write_csv(data, arguments.out, force=arguments.force)
-    print(f"{arguments.out}: {len(data)} measurements, {len(data.channels)} channels, BRDF in 1/sr")
+    print(f"{arguments.out}: {len(data)} {what}, {len(data.channels)} channels, {quantity}")
     return DONE
 
 

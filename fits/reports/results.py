@@ -29,7 +29,6 @@ from fits._files import (
     write_json,
     write_text,
 )
-from fits.data.formats import totals_csv
 from fits.data.formats.csv import write_csv
 from fits.data.measurements import Measurements, Source
 from fits.data.reading import read
@@ -84,12 +83,9 @@ def write_fit(fit: "Fit", folder: Path, text: str | None = None) -> None:
     problem, transport, data = fit.problem, fit.problem.transport, fit.problem.data
     if transport != "auto" and not isinstance(transport, Transport):
         raise ValueError(f"transport is {transport!r}: only 'auto' and layerjax's own can be saved")
-    scale, spheres = problem.scale if isinstance(problem.scale, Free) else None, None
-    if isinstance(data, Totals):
-        totals_csv.write(data.used(), folder / DATA)
-        spheres = data.spheres  # which the file cannot hold
-    else:
-        write_csv(data, folder / DATA)
+    scale = problem.scale if isinstance(problem.scale, Free) else None
+    spheres = data.spheres if isinstance(data, Totals) else None  # which the file cannot hold
+    write_csv(data, folder / DATA)
     if text is not None:
         write_text(folder / PROBLEM, text)
     else:
