@@ -80,7 +80,10 @@ class Totals(Measurements):
         if len(count) > 1:
             raise ValueError(f"totals: {sorted(count)} channels are given, must be as many for every kind")
         names = tuple(channels) if channels is not None else channel_names(*count)
-        spreads = {kind: _columns("sigma", _sigma_of(sigma, kind), len(angles), *count) for kind in measured}
+        sigmas = sigma if isinstance(sigma, Mapping) else dict.fromkeys(measured, sigma)
+        if missing := measured.keys() - sigmas.keys():
+            raise ValueError(f"sigma has nothing for {', '.join(sorted(missing))}")
+        spreads = {kind: _columns("sigma", sigmas[kind], len(angles), *count) for kind in measured}
         wi = direction(angles, LIGHT_AZIMUTH)
         kinds = [kind for kind in KINDS if kind in measured for _ in angles]
         return cls(
@@ -106,11 +109,3 @@ def _columns(name: str, value: ArrayLike, rows: int, columns: int | None = None)
         return np.broadcast_to(array, (rows, columns or (array.shape[1] if array.ndim == 2 else 1))).copy()
     except ValueError:
         raise ValueError(f"{name} has shape {np.shape(value)}, must be a number, ({rows},) or ({rows}, C)") from None
-
-
-def _sigma_of(sigma: float | Mapping[str, ArrayLike], kind: str) -> ArrayLike:
-    if not isinstance(sigma, Mapping):
-        return sigma
-    if kind not in sigma:
-        raise ValueError(f"sigma has nothing for {kind}")
-    return sigma[kind]

@@ -22,7 +22,7 @@ from fits.sampling.proposals import Density, FittedProposal
 from layerjax._checks import require_count, require_kind, require_seed
 from layerjax._numerics import broadcasting
 
-# pareto k above which a part of the posterior may be missing; below it the draws suffice
+# Pareto k above which a part of the posterior may be missing; below it the draws suffice
 MAX_PARETO_K = ComparisonOptions().max_pareto_k
 
 FINITE_VARIANCE, ROUNDS = 0.5, 3
@@ -86,6 +86,8 @@ def importance_draws(
         Jacobians. Otherwise they are used if neither approximations about the minima nor `proposal` suffice.
     proposal: an approximation of a posterior similar to the fit's.
     """
+    import arviz
+
     proposals: list[Density] = []
     positions, log_posterior = np.empty((0, len(fit.vector))), np.empty(0)
 
@@ -99,9 +101,11 @@ def importance_draws(
         densities = [one.log_density(positions) for one in proposals]
         weights = log_posterior - (logsumexp(densities, axis=0) - np.log(len(densities)))
         weights = np.where(np.isfinite(weights), weights, -np.inf)
-        if not np.isfinite(weights).any():
-            return ImportanceDraws(positions, weights, np.inf)
-        return ImportanceDraws(positions, weights, _pareto_k(np.maximum(weights - weights.max(), -700.0)))
+        pareto_k = np.inf
+        if np.isfinite(weights).any():
+            with np.errstate(over="ignore"):  # in the tail that it fits where all weights but a few are next to nothing
+                pareto_k = float(arviz.psislw(np.maximum(weights - weights.max(), -700.0))[1])
+        return ImportanceDraws(positions, weights, pareto_k)
 
     def adapt(weighted: ImportanceDraws) -> ImportanceDraws:
         """With draws of mixtures fitted to the weighted ones, until they suffice."""
@@ -119,17 +123,6 @@ def importance_draws(
         if not weighted.suffices(MAX_PARETO_K):
             weighted = add(initial_mixture(fit, BATCH))
     return adapt(weighted)
-
-
-def _pareto_k(log_weights: Floats) -> float:
-    import arviz
-
-    if not hasattr(arviz, "psislw"):  # from 1.0 on
-        from arviz_stats.base import array_stats
-
-        return float(array_stats.psislw(log_weights)[1])
-    with np.errstate(over="ignore"):  # in the tail that it fits where all weights but a few are next to nothing
-        return float(arviz.psislw(log_weights)[1])
 
 
 def _resample(log_weights: Floats, generator: np.random.RandomState, count: int) -> NDArray[np.int64]:

@@ -61,6 +61,10 @@ class FitReport:
 
     def page(self) -> str:
         """The HTML text, with the pictures inside."""
+        import tomli_w
+
+        from fits.problem.stack_file import material_to_dict
+
         fit, data = self.fit, self.fit.problem.data
         facts = verdicts.assess(fit, self.options)
         opening = verdicts.verdict(fit, facts)
@@ -106,12 +110,12 @@ class FitReport:
             f"{verdicts.starts_in_words(fit)}.",
         ]
         correlation = _picture(parameters.correlation_picture(fit), "Correlation of the fitted parameters.")
-        title = f"Fit of {source_name(data)}"
+        title, stack = f"Fit of {source_name(data)}", tomli_w.dumps(material_to_dict(fit.stack))
         body = [
             f"<h1>{html.escape(title)}</h1>",
             verdict(opening.sentences, opening.sound),
             sentences(opening.remarks) if opening.remarks else "",
-            section("Values", tables.parameter_table(fit, both=True), _stack_text(fit)),
+            section("Values", tables.parameter_table(fit, both=True), f"<pre>{html.escape(stack)}</pre>"),
             section("Data and model", *compared),
             section("Diagnostics", residuals, tables.incidence_table(fit), tables.minima_table(fit)),
             section("Identifiability", [identified], tables.unidentified_table(fit), correlation),
@@ -131,14 +135,6 @@ class FitReport:
 def source_name(data: Measurements) -> str:
     """The file's name, or what the data is where there is none."""
     return Path(data.source.path).name or f"{data.source.format} data"
-
-
-def _stack_text(fit: "Fit") -> str:
-    import tomli_w
-
-    from fits.problem.stack_file import material_to_dict
-
-    return f"<pre>{html.escape(tomli_w.dumps(material_to_dict(fit.stack)))}</pre>"
 
 
 def _picture(figure: "Figure | None", caption: str) -> str:

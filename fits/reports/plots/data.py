@@ -72,8 +72,11 @@ def data_picture(data: "Measurements") -> Figure:
         if flat.any():
             panels = parts[0].subplots(1, len(data.channels), sharey=True, squeeze=False)[0]
             for channel, axes in enumerate(panels):
-                for incidence, colour in zip(shown, ordered_colours(len(shown)), strict=True):
-                    rows = incidence.rows[flat[incidence.rows]]
+                for incidence, place in zip(shown, np.linspace(0.0, 0.85, len(shown)), strict=True):  # dark to light
+                    rows, colour = (
+                        incidence.rows[flat[incidence.rows]],
+                        mpl.colors.to_hex(mpl.colormaps["viridis"](place)),
+                    )
                     draw_points(axes, data, rows[used[rows]], channel, colour, incidence.label, data.sigma)
                     draw_points(axes, data, rows[~used[rows]], channel, GREY)
                 value_axis(axes, data.values[flat], value_label(data, channel))
@@ -152,11 +155,6 @@ def mapped(data: "Measurements", shown: list[Incidence]) -> list[Incidence]:
 def value_label(data: "Measurements", channel: int) -> str:
     """The name of an axis of values; it says which channel where there are several."""
     return "BRDF, 1/sr" if len(data.channels) == 1 else f"BRDF {data.channels[channel]}, 1/sr"
-
-
-def ordered_colours(count: int) -> list[str]:
-    """`count` colours that run from dark to light, for values that have an order."""
-    return [mpl.colors.to_hex(mpl.colormaps["viridis"](place)) for place in np.linspace(0.0, 0.85, count)]
 
 
 def channel_colour(channel: str, index: int) -> str:

@@ -113,29 +113,30 @@ class _Curve(NamedTuple):
 
 def _curves(fit: "Fit", shown: list[Incidence], posterior: "Posterior | None") -> list[_Curve]:
     """The model along each incidence, all of them predicted at once."""
-    data, signed = fit.problem.data, signed_angle(fit.problem.data)
-    angles, wi, wo = [], [], []
+    signed, angles = signed_angle(fit.problem.data), []
     for incidence in shown:
         own = signed[incidence.rows]
         angle = np.arange(np.floor(own.min()), np.ceil(own.max()) + STEP / 2, STEP)
         angles.append(np.clip(angle, -STEEPEST, STEEPEST))
-        wi.append(np.tile(direction(incidence.theta, incidence.phi), (len(angle), 1)))
-        wo.append(direction(angles[-1], incidence.phi + 180.0))
+    each = list(zip(shown, angles, strict=True))
+    wi = np.concatenate([np.tile(direction(one.theta, one.phi), (len(angle), 1)) for one, angle in each])
+    wo = np.concatenate([direction(angle, one.phi + 180.0) for one, angle in each])
     vectors = fit.vector[None]
     if posterior is not None:
         picked = np.linspace(0, len(posterior.samples) - 1, INTERVAL_DRAWS).astype(int)
         vectors = np.concatenate([vectors, np.asarray(posterior.samples)[picked]])
-    towards = np.concatenate(wi), np.concatenate(wo)
-    values = np.asarray(fit.problem.predict_at(vectors, *towards))
-    values = np.broadcast_to(values, (*values.shape[:2], data.values.shape[1]))  # a grey stack is the same in all
+    values = np.asarray(fit.problem.predict_at(vectors, wi, wo))
+    values = np.broadcast_to(
+        values, (*values.shape[:2], len(fit.problem.data.channels))
+    )  # a grey stack is the same in all
+
+    def parts(along: Floats | None, axis: int = 0) -> list[Any]:
+        cuts = np.cumsum([len(angle) for angle in angles])[:-1]
+        return [None] * len(angles) if along is None else np.split(along, cuts, axis)
+
+    best, latent = with_discrepancy(fit, wi, wo, values[0]), values[0] if fit.problem.noise.discrepancy else None
     interval = None if posterior is None else np.quantile(values[1:], [0.025, 0.975], axis=0)
-    best = with_discrepancy(fit, *towards, values[0])
-    curves = []
-    for angle, end in zip(angles, np.cumsum([len(angle) for angle in angles]), strict=True):
-        own = slice(end - len(angle), end)
-        latent = values[0, own] if fit.problem.noise.discrepancy else None
-        curves.append(_Curve(angle, best[own], latent, None if interval is None else interval[:, own]))
-    return curves
+    return [_Curve(*one) for one in zip(angles, parts(best), parts(latent), parts(interval, 1), strict=True)]
 
 
 def _points(axes: Axes, fit: "Fit", rows: np.ndarray, coloured: bool) -> None:
