@@ -142,6 +142,38 @@ def test_evidence_is_that_of_regression(found: Fit, flat: Fit) -> None:
         assert got.log_evidence == pytest.approx(law.logpdf(DATA.values[:, 0]), abs=5.0 * got.error)
 
 
+def product(stack, wi, wo):
+    return (stack["a"] * stack["b"] + 0.0 * wo[:, 2])[:, None]
+
+
+@pytest.mark.parametrize(
+    ("transport", "free", "truth"),
+    [
+        (product, {"a": Free(1.0, 0.1, 5.0), "b": Free(1.0, 0.1, 5.0)}, {"a": 1.0, "b": 0.8}),  # a hyperbola
+        (line, {"a": Free(0.5, 0.0, 1.0), "b": Free(0.1, -1.0, 3.0)}, {"a": 1.02, "b": 0.5}),  # beyond a bound
+        (product, {"a": Free(0.1, 0.0, 1.0), "b": Free(0.1, 0.0, 1.0)}, {"a": 0.0, "b": 0.0}),  # nothing is known
+    ],
+)
+def test_evidence_is_the_integral_over_the_box(transport: Any, free: dict[str, Free], truth: dict[str, float]) -> None:
+    """Of posteriors that are no ellipsoids, beside quadrature; the noise is so large that the box matters."""
+    at, sigma, count = slices([10.0, 50.0], np.arange(-75.0, 76.0, 10.0)), 0.1, 1500
+    exact = np.asarray(transport(truth, at.wi, at.wo))
+    data = along(at, exact + sigma * np.random.default_rng(0).standard_normal(exact.shape), sigma)
+    one = fit(free, data, transport=transport, noise=Noise(discrepancy=False), starts=2)
+    sides = [np.linspace(low, high, count + 1) for low, high in zip(one.problem.low, one.problem.high, strict=True)]
+    a, b = np.meshgrid(*(0.5 * (side[1:] + side[:-1]) for side in sides), indexing="ij")
+    # both are linear in two numbers: squares of the residuals by their moments
+    y = data.values[:, 0]
+    first, second, x = (a, b, at.wo[:, 2]) if transport is line else (0.0, a * b, np.ones(len(at)))
+    squares = y @ y - 2.0 * first * y.sum() - 2.0 * second * (x @ y)
+    squares = squares + first**2 * x.size + 2.0 * first * second * x.sum() + second**2 * (x @ x)
+    logs = -0.5 * squares / sigma**2 - y.size * np.log(sigma * np.sqrt(2.0 * np.pi))
+    estimate = evidence(one)
+    assert estimate.reliable
+    assert abs(estimate.log_evidence - float(logsumexp(logs) - 2.0 * np.log(count))) < 4.0 * estimate.error
+    assert estimate.error < 0.1
+
+
 def test_weights_of_stacking_are_the_best() -> None:
     generator = np.random.default_rng(0)
     densities = generator.standard_normal((3, 200)) + np.array([[0.3], [0.2], [-5.0]])
