@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from fits.data.geometry import TANGENT_COSINE, Floats, Pairs
-from fits.data.selection import Angles, rows_of
+from fits.data.scans import Angles, rows_of
 from fits.names import QUANTITIES, Quantity
 
 LARGEST, SMALLEST_SIGMA = 1e30, 1e-100

@@ -11,7 +11,7 @@ import numpy as np
 from fits._files import given_path
 from fits.data.formats import FileOptions, read_file
 from fits.data.measurements import Measurements
-from fits.data.selection import select
+from fits.data.scans import select
 from fits.data.totals import Totals
 
 CHANNELS = "channels="
@@ -57,7 +57,7 @@ class ReadOptions(FileOptions):
         wavelengths, corrected: for iad's files only: see `read_slab`.
         min_retro_angle: mask measurements closer than so many degrees to retro-reflection.
         max_polar_angle: mask measurements more than so many degrees from the normal.
-        select: use only these data (see `fits.data.selection.select`, and ``channels=red,green``).
+        select: use only these data (see `fits.data.scans.select`, and ``channels=red,green``).
         hold_out: hold these data out of the fit, so that their prediction can be scored.
     """
 

@@ -9,7 +9,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -36,7 +36,6 @@ from layerjax._checks import in_short, require_count, require_kind, require_numb
 from layerjax.compiling import programs_kept
 
 if TYPE_CHECKING:
-    from fits.prediction.average import Average
     from fits.sampling.proposals import Density
 
 LEVELS = (0.025, 0.25, 0.5, 0.75, 0.975)
@@ -246,9 +245,15 @@ def scores(prediction: Prediction, measurements: Measurements, rows: NDArray[np.
     )
 
 
+class Predictor(Protocol):
+    """Several fits that predict as one: see `fits.average`."""
+
+    def predict(self, at: Geometry | Measurements, *, draws: int, seed: int) -> Prediction: ...
+
+
 @programs_kept()
 def predict(
-    fitted: "Fit | Posterior | Average",
+    fitted: Fit | Posterior | Predictor,
     at: Geometry | Measurements,
     *,
     draws: int = DRAWS,

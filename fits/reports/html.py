@@ -18,7 +18,7 @@ from fits.optimise.uncertainty import UNIDENTIFIED_BEYOND
 from fits.reports import tables, verdicts
 from fits.reports.data_summary import source_rows
 from fits.reports.pages import Part, Table, document, html_table, image, made_with, section, sentences, verdict
-from fits.reports.plots import model, parameters
+from fits.reports.plots import model
 from fits.reports.plots.data import as_png, totals_picture
 from fits.reports.results import REPORT
 from fits.reports.verdicts import ReportOptions, reportable
@@ -101,7 +101,7 @@ class FitReport:
         if self.posterior is not None:
             sampling = [verdicts.sampled(self.posterior)]
             if self.estimates is not None:
-                corner = parameters.corner_picture(self.estimates)
+                corner = model.corner_picture(self.estimates)
                 sampling.append(tables.posterior_table(self.estimates))
                 sampling.append(_picture(corner, "Samples of the posterior; orange: the best fit."))
 
@@ -109,7 +109,7 @@ class FitReport:
             *(one.sentence for one in verdicts.statements(facts)["residuals"]),
             f"{verdicts.starts_in_words(fit)}.",
         ]
-        correlation = _picture(parameters.correlation_picture(fit), "Correlation of the fitted parameters.")
+        correlation = _picture(model.correlation_picture(fit), "Correlation of the fitted parameters.")
         title, stack = f"Fit of {source_name(data)}", tomli_w.dumps(material_to_dict(fit.stack))
         body = [
             f"<h1>{html.escape(title)}</h1>",

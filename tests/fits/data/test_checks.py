@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 
 import fits
-from fits.data.checks import energies, reciprocity, repeats, sides
 from fits.data.measurements import Measurements
-from fits.reports.data_summary import data_statements
+from fits.reports.data_summary import data_statements, energies, reciprocity, repeats, sides
 from tests.helpers.models import along
 from tests.helpers.places import COATINGS
 

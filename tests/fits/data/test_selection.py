@@ -8,8 +8,7 @@ from scipy.signal import lfilter
 
 from fits.data.geometry import Geometry, direction, slices
 from fits.data.measurements import Measurements
-from fits.data.scans import correlation, in_plane, incidences, neighbours, relative_azimuth, signed_angle
-from fits.data.selection import select
+from fits.data.scans import correlation, in_plane, incidences, neighbours, relative_azimuth, select, signed_angle
 from tests.helpers.models import along
 
 

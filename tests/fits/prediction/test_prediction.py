@@ -8,7 +8,7 @@ from scipy import stats
 
 from fits.data.geometry import slices
 from fits.data.measurements import Measurements
-from fits.data.selection import select
+from fits.data.scans import select
 from fits.optimise.fit import fit
 from fits.optimise.result import Fit
 from fits.prediction.predict import LEVELS, predict, scores
