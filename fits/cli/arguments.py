@@ -229,7 +229,7 @@ COMMANDS = {
         },
     ),
     "render": Command(
-        "draw a material: spheres, lobes and a map of its BSDF",
+        "draw a material: spheres and lobes",
         "layerjax render window_shade --out window_shade.png",
         {"material": MATERIAL, "--out": _out("PNG", "file to write; its name ends in .png")},
         "--force",

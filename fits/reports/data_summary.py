@@ -148,10 +148,7 @@ class Agreement(NamedTuple):
 
 
 class Energy(NamedTuple):
-    """Share (C,) of light at polar angle `theta` that is reflected into the covered part of the hemisphere.
-
-    covered: that part, as a share of the projected hemisphere.
-    """
+    """Share (C,) of light at polar angle `theta` that is reflected into the `covered` share of the hemisphere."""
 
     theta: float
     share: tuple[float, ...]
@@ -159,8 +156,7 @@ class Energy(NamedTuple):
 
 
 class Sides(NamedTuple):
-    """Brightest measurements in the plane of incidence, for light at polar angle `theta`, on the side of the light and
-    on the mirror side; NaN if all of them are on the side of the light."""
+    """Brightest measurements in the plane of incidence on the sides of light and mirror; NaN if that was not seen."""
 
     theta: float
     light: float
