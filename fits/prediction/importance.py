@@ -108,7 +108,7 @@ def importance_draws(
         return ImportanceDraws(positions, weights, pareto_k)
 
     def adapt(weighted: ImportanceDraws) -> ImportanceDraws:
-        """With draws of mixtures fitted to the weighted ones, until they suffice."""
+        """The draws, with those of mixtures that are fitted to them until all suffice."""
         for _ in range(ROUNDS):
             if weighted.suffices(max_pareto_k) or not np.isfinite(weighted.log_weights).any():
                 break

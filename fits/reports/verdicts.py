@@ -82,7 +82,7 @@ class Assessment:
 
     @property
     def size(self) -> str:
-        """Of the residuals, beside what is expected."""
+        """Whether the residuals are larger or smaller than expected."""
         limit = self.options.significance
         return "large" if self.excess > limit else "small" if self.excess < -limit else "expected"
 
