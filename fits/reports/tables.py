@@ -13,9 +13,8 @@ from fits.data.measurements import Measurements
 from fits.data.scans import incidences
 from fits.optimise.limits import instrument_limits
 from fits.prediction.predict import LEVELS, scores
-from fits.reports.diagnostics import standardised
 from fits.reports.pages import Table
-from fits.reports.verdicts import identifiability, numerical_error
+from fits.reports.verdicts import identifiability, numerical_error, standardised
 
 if TYPE_CHECKING:
     from fits.optimise.result import Fit

@@ -20,7 +20,6 @@ from fits.optimise.result import OUTCOMES
 from fits.optimise.uncertainty import UNCONSTRAINED_BEYOND, UNIDENTIFIED_BEYOND, Direction
 from fits.problem.model import Model
 from fits.problem.noise import DEFAULT_RELATIVE
-from fits.reports.diagnostics import standardised
 from layerjax._checks import require_number
 
 if TYPE_CHECKING:
@@ -51,6 +50,30 @@ class ReportOptions:
 
 
 DEFAULT = ReportOptions()
+
+
+# ---- residuals ----
+
+
+def over_all_rows(fit: "Fit", values: np.ndarray) -> np.ndarray:
+    """Values (used samples, C) of a fit spread over every row of its data, (N, C); NaN in rows that were not used."""
+    mask = fit.problem.data.mask
+    spread = np.full((len(mask), np.shape(values)[1]), np.nan)
+    spread[mask] = values
+    return spread
+
+
+def standardised(fit: "Fit") -> np.ndarray:
+    """Residuals of every row that are independent standard normal if the model holds, (N, C); NaN in unused rows.
+
+    They are in units of the noise; with a model discrepancy, whitened by the covariance of both.
+    """
+    return over_all_rows(fit, fit.residuals / residual_unit(fit))
+
+
+def residual_unit(fit: "Fit") -> float:
+    """Noise, or the scatter that is left where a named objective has no noise model."""
+    return 1.0 if fit.is_posterior else math.sqrt(fit.chi_square / max(fit.degrees_of_freedom, 1))
 
 
 # ---- facts ----

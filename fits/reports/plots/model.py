@@ -12,7 +12,6 @@ from fits.data.geometry import Floats, direction
 from fits.data.scans import Incidence, in_plane, signed_angle
 from fits.prediction.predict import with_discrepancy
 from fits.problem.model import Model
-from fits.reports.diagnostics import bsdf, misfit, over_all_rows, residual_label
 from fits.reports.plots.data import (
     ANGLE_LABEL,
     CYCLE,
@@ -28,6 +27,7 @@ from fits.reports.plots.data import (
     value_label,
     value_norm,
 )
+from fits.reports.verdicts import over_all_rows, residual_unit
 
 if TYPE_CHECKING:
     from fits.data.measurements import Measurements
@@ -39,6 +39,28 @@ INTERVAL_DRAWS = 200  # posterior draws behind an interval
 STEEPEST = 89.9  # degrees: in the tangent plane every BRDF of a stack is 0
 STEP = 1.0  # degrees between the points of a model curve
 FEWEST_IN_PLANE = 3  # measurements that make a panel
+
+
+def bsdf(fit: "Fit") -> np.ndarray:
+    """Predicted BSDF at every row, with the model discrepancy, (N, C), in 1/sr; NaN in unused rows."""
+    used = fit.problem.data.used()
+    return over_all_rows(fit, with_discrepancy(fit, used.wi, used.wo, fit.predicted))
+
+
+def misfit(fit: "Fit") -> np.ndarray:
+    """Measurements less `bsdf`, in units of the noise, (N, C); NaN in rows that were not used.
+
+    With a model discrepancy these are smaller than the noise, since it follows the data: `standardised` are not.
+    """
+    independent = np.asarray(fit.problem.call(Model.offsets_after_discrepancy_at, fit.vector, fit.predicted), float)
+    return over_all_rows(fit, independent / residual_unit(fit))
+
+
+def residual_label(fit: "Fit") -> str:
+    """The name of an axis of a `misfit`."""
+    if not fit.is_posterior:
+        return f"residual of {fit.problem.objective} / its scatter"
+    return rf"(data $-$ {'with discrepancy' if fit.problem.noise.discrepancy else 'model'}) / $\sigma$"
 
 
 def curves_picture(fits: "dict[str, Fit]", posterior: "Posterior | None" = None) -> Figure | None:

@@ -20,11 +20,11 @@ from fits.optimise.result import Fit
 from fits.problem.noise import Noise
 from fits.problem.parameters import Free
 from fits.reports import tables
-from fits.reports.diagnostics import standardised
 from fits.reports.html import FitReport
 from fits.reports.plots import data as pictures
 from fits.reports.plots import model as model_pictures
 from fits.reports.tables import Table, degrees, print_table, with_error
+from fits.reports.verdicts import standardised
 from tests.helpers.models import along
 
 

@@ -18,9 +18,8 @@ from fits.problem.noise import Noise
 from fits.problem.parameters import Free
 from fits.problem.problem import Problem
 from fits.reports import tables, verdicts
-from fits.reports.diagnostics import bsdf, misfit, standardised
-from fits.reports.plots.model import curves_picture
-from fits.reports.verdicts import assess, identifiability
+from fits.reports.plots.model import bsdf, curves_picture, misfit
+from fits.reports.verdicts import assess, identifiability, standardised
 from tests.helpers.models import along, drawn_discrepancy, line
 
 GEOMETRY = slices([10.0, 30.0, 50.0, 70.0], np.arange(-80.0, 81.0, 4.0))
