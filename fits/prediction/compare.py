@@ -19,23 +19,21 @@ from layerjax.compiling import programs_kept
 
 @dataclass(frozen=True)
 class ComparedFit:
-    """One fit in a comparison.
-
-    parameters: number of fitted parameters. aic, bic: Akaike's and the Bayesian information criterion, NaN for a named
-    objective. model_score: elpd of held-out incidences, stacking weight and evidence; None without `refit`.
-    """
+    """One fit in a comparison; model_score: elpd of held-out incidences, stacking weight and evidence, with `refit`."""
 
     name: str
-    parameters: int
-    chi_square: float
-    degrees_of_freedom: int
-    reduced_chi_square: float
-    log_likelihood: float
-    aic: float
-    bic: float
-    converged: bool
-    at_bound: tuple[str, ...]
+    fit: Fit
     model_score: ModelScore | None = None
+
+    @property
+    def aic(self) -> float:
+        """Akaike's information criterion; NaN for a named objective."""
+        return 2.0 * len(self.fit.vector) - 2.0 * self.fit.log_likelihood
+
+    @property
+    def bic(self) -> float:
+        """The Bayesian information criterion; NaN for a named objective."""
+        return len(self.fit.vector) * math.log(self.fit.problem.count) - 2.0 * self.fit.log_likelihood
 
 
 @dataclass(frozen=True)
@@ -93,33 +91,20 @@ def compare(
         raise ValueError(f"compare: {len(candidates)} candidate(s) given; at least 2 are needed")
     fits, options = fits_of(candidates), options or ComparisonOptions()
     _require_comparable(fits)
-    rows = []
-    for name, fit in fits.items():
-        count, likelihood = len(fit.vector), fit.log_likelihood
-        rows.append(
-            ComparedFit(
-                name=name,
-                parameters=count,
-                chi_square=fit.chi_square,
-                degrees_of_freedom=fit.degrees_of_freedom,
-                reduced_chi_square=fit.reduced_chi_square,
-                log_likelihood=likelihood,
-                aic=2.0 * count - 2.0 * likelihood,
-                bic=count * math.log(fit.problem.count) - 2.0 * likelihood,
-                converged=fit.converged,
-                at_bound=fit.at_bound,
-            )
-        )
+    rows = [ComparedFit(name, fit) for name, fit in fits.items()]
     if refit:
         scores = model_scores(fits, progress, options)
         rows = [replace(row, model_score=scores[row.name]) for row in rows]
         rows.sort(key=lambda row: -scores[row.name].elpd)
         sorted_by = "elpd"
+    elif rows[0].fit.is_posterior:
+        rows.sort(key=lambda row: row.aic)
+        sorted_by = "aic"
     else:
-        sorted_by = "aic" if next(iter(fits.values())).is_posterior else "chi_square"
-        rows.sort(key=lambda row: getattr(row, sorted_by))
+        rows.sort(key=lambda row: row.fit.chi_square)
+        sorted_by = "chi_square"
     verdict = tuple(_verdict(rows[0], row, sorted_by, options) for row in rows[1:])
-    return Comparison(tuple(rows), sorted_by, verdict, tuple(_notes(fits, rows, options)), options)
+    return Comparison(tuple(rows), sorted_by, verdict, tuple(_notes(rows, options)), options)
 
 
 def _require_comparable(fits: Mapping[str, Fit]) -> None:
@@ -152,8 +137,8 @@ def _verdict(best: ComparedFit, other: ComparedFit, sorted_by: str, options: Com
         difference = 2.0 * score.clear_diff
         words = f"elpd difference {score.elpd_diff:.1f} ± {score.dse:.1f} by cross-validation"
     else:
-        excess = max(1.0, best.reduced_chi_square) if best.degrees_of_freedom > 0 else 1.0
-        gain = 2.0 * (best.log_likelihood - other.log_likelihood)
+        excess = max(1.0, best.fit.reduced_chi_square) if best.fit.degrees_of_freedom > 0 else 1.0
+        gain = 2.0 * (best.fit.log_likelihood - other.fit.log_likelihood)
         correction = gain / excess - gain
         aic, bic = other.aic - best.aic + correction, other.bic - best.bic + correction
         difference = min(aic, bic)
@@ -165,17 +150,17 @@ def _verdict(best: ComparedFit, other: ComparedFit, sorted_by: str, options: Com
     return f"The data {prefer} {best.name} to {other.name}: {words}."
 
 
-def _notes(fits: Mapping[str, Fit], rows: list[ComparedFit], options: ComparisonOptions) -> list[str]:
+def _notes(rows: list[ComparedFit], options: ComparisonOptions) -> list[str]:
     notes = []
     for what in ("noise", "transport", "scale"):
-        settings = {name: repr(getattr(fit.problem, what)) for name, fit in fits.items()}
+        settings = {row.name: repr(getattr(row.fit.problem, what)) for row in rows}
         if len(set(settings.values())) > 1:
             notes.append(f"the fits differ in {what}: " + "; ".join(f"{name}: {one}" for name, one in settings.items()))
-    if failed := [row.name for row in rows if not row.converged]:
+    if failed := [row.name for row in rows if not row.fit.converged]:
         notes.append(f"not converged: {', '.join(failed)}")
     unsure = [row.name for row in rows if row.model_score and row.model_score.evidence.pareto_k >= options.max_pareto_k]
     if unsure:
         notes.append(f"the evidence is unreliable, its importance weights have a high Pareto k: {', '.join(unsure)}")
-    if min(row.reduced_chi_square for row in rows) > options.max_reduced_chi_square:
+    if min(row.fit.reduced_chi_square for row in rows) > options.max_reduced_chi_square:
         notes.append("no candidate explains the data within its noise: the criteria overstate differences")
     return notes

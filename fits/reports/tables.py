@@ -192,17 +192,18 @@ def incidence_table(fit: "Fit") -> Table:
 
 def comparison_table(comparison: "Comparison") -> Table:
     """One row per fit, the best first: goodness of fit, number of parameters, and predictive score or else AIC."""
-    fits, rows = comparison.rows, []
-    aic, bic = min(fit.aic for fit in fits), min(fit.bic for fit in fits)
-    for fit in fits:
-        cells = {"fit": fit.name, "parameters": str(fit.parameters), "chi2/dof": f"{fit.reduced_chi_square:.4g}"}
-        if (score := fit.model_score) is not None:
+    rows = []
+    aic, bic = min(row.aic for row in comparison.rows), min(row.bic for row in comparison.rows)
+    for row in comparison.rows:
+        fit, number = row.fit, str(len(row.fit.vector))
+        cells = {"fit": row.name, "parameters": number, "chi2/dof": f"{fit.reduced_chi_square:.4g}"}
+        if (score := row.model_score) is not None:
             cells |= {"elpd": f"{score.elpd:.1f}", "elpd_diff ± dse": f"{score.elpd_diff:.1f} ± {score.dse:.1f}"}
             evidence = f"{score.evidence.log_evidence:.1f} ± {score.evidence.error:.1f}"
             cells |= {"weight": f"{score.weight:.2f}", "log evidence": evidence}
             cells["model probability"] = f"{score.model_probability:.2g}"
         elif math.isfinite(aic):
-            differences = {"AIC - best": f"{fit.aic - aic:.1f}", "BIC - best": f"{fit.bic - bic:.1f}"}
+            differences = {"AIC - best": f"{row.aic - aic:.1f}", "BIC - best": f"{row.bic - bic:.1f}"}
             cells |= {"log-lik.": f"{fit.log_likelihood:.2f}", **differences}
         cells |= {"converged": "yes" if fit.converged else "NO", "at a bound": ", ".join(fit.at_bound)}
         rows.append(tuple(cells.values()))

@@ -33,9 +33,9 @@ def test_criteria_are_those_of_the_books(fits: dict) -> None:
         x = design(COUNT)[:, :columns]
         rest = DATA.values[:, 0] - x @ np.linalg.lstsq(x, DATA.values[:, 0], rcond=None)[0]
         likelihood = stats.norm.logpdf(rest, 0, 0.05).sum()
-        assert row.chi_square == pytest.approx(np.sum(rest**2) / 0.05**2, rel=1e-8)
-        assert row.degrees_of_freedom == COUNT - columns
-        assert row.log_likelihood == pytest.approx(likelihood, rel=1e-8)
+        assert row.fit.chi_square == pytest.approx(np.sum(rest**2) / 0.05**2, rel=1e-8)
+        assert row.fit.degrees_of_freedom == COUNT - columns
+        assert row.fit.log_likelihood == pytest.approx(likelihood, rel=1e-8)
         assert row.aic == pytest.approx(2 * columns - 2 * likelihood, rel=1e-8)
         assert row.bic == pytest.approx(columns * math.log(COUNT) - 2 * likelihood, rel=1e-8)
 
@@ -58,8 +58,8 @@ def test_a_misfit_counts_as_noise_in_the_verdict() -> None:
     comparison = compare({name: fit(stack, poor, transport=line) for name, stack in (("flat", FLAT), ("line", LINE))})
     assert any("no candidate explains the data" in note for note in comparison.notes)
     best, other = comparison.rows
-    assert 80 < best.reduced_chi_square < 130
-    gain = (other.chi_square - best.chi_square) / best.reduced_chi_square
+    assert 80 < best.fit.reduced_chi_square < 130
+    gain = (other.fit.chi_square - best.fit.chi_square) / best.fit.reduced_chi_square
     words = f"AIC difference {gain - 2:.1f}, BIC difference {gain - math.log(COUNT):.1f} (noise scaled to the residuals"
     assert words in comparison.verdict[0]
 
