@@ -1,6 +1,6 @@
 """Pictures of a fit, and of predictions, beside data, and of its parameters."""
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import matplotlib as mpl
 import numpy as np
@@ -121,20 +121,12 @@ def _in_plane(data: "Measurements") -> list[Incidence]:
     return [Incidence(one.theta, one.phi, one.rows[flat[one.rows]]) for one in enough]
 
 
-class _Curve(NamedTuple):
-    """The model along one incidence: viewing angles (M,), values (M, C), and an interval's two ends (2, M, C) or None.
+def _curves(fit: "Fit", shown: list[Incidence], posterior: "Posterior | None") -> list[tuple[Any, ...]]:
+    """The model along each incidence, all of them predicted at once.
 
-    latent: (M, C), of the stack without the model discrepancy, as is the interval; None where there is no discrepancy.
+    Viewing angles (M,), BSDF (M, C), that of the stack without the model discrepancy, and the ends of an interval of
+    the latter, (2, M, C); None where there is no discrepancy, or no posterior.
     """
-
-    angle: Floats
-    values: Floats
-    latent: Floats | None
-    interval: Floats | None
-
-
-def _curves(fit: "Fit", shown: list[Incidence], posterior: "Posterior | None") -> list[_Curve]:
-    """The model along each incidence, all of them predicted at once."""
     signed, angles = signed_angle(fit.problem.data), []
     for incidence in shown:
         own = signed[incidence.rows]
@@ -158,7 +150,7 @@ def _curves(fit: "Fit", shown: list[Incidence], posterior: "Posterior | None") -
 
     best, latent = with_discrepancy(fit, wi, wo, values[0]), values[0] if fit.problem.noise.discrepancy else None
     interval = None if posterior is None else np.quantile(values[1:], [0.025, 0.975], axis=0)
-    return [_Curve(*one) for one in zip(angles, parts(best), parts(latent), parts(interval, 1), strict=True)]
+    return list(zip(angles, parts(best), parts(latent), parts(interval, 1), strict=True))
 
 
 def _points(axes: Axes, fit: "Fit", rows: np.ndarray, coloured: bool) -> None:
@@ -175,19 +167,19 @@ def _points(axes: Axes, fit: "Fit", rows: np.ndarray, coloured: bool) -> None:
         draw_points(axes, data, rows[~used], channel, GREY, None if channel else "not used")
 
 
-def _line(axes: Axes, curve: _Curve, channel: int, colour: str, label: str | None, place: int) -> None:
+def _line(axes: Axes, curve: tuple[Any, ...], channel: int, colour: str, label: str | None, place: int) -> None:
     """One channel of a model, labelled for the legend where it is the first."""
-    discrepancy = curve.latent is not None
-    what = f"{label} with discrepancy" if label and discrepancy else label
-    axes.plot(curve.angle, curve.values[:, channel], color=colour, linewidth=1.3, label=what, zorder=3)
-    if curve.latent is not None:
+    angle, values, latent, interval = curve
+    what = label if label is None or latent is None else f"{label} with discrepancy"
+    axes.plot(angle, values[:, channel], color=colour, linewidth=1.3, label=what, zorder=3)
+    if latent is not None:
         what = "without discrepancy" if label and not place else None
-        axes.plot(curve.angle, curve.latent[:, channel], "--", color=colour, linewidth=1.0, label=what, zorder=3)
-    if curve.interval is not None:
-        which = ", without discrepancy" if discrepancy else ""
+        axes.plot(angle, latent[:, channel], "--", color=colour, linewidth=1.0, label=what, zorder=3)
+    if interval is not None:
+        which = ", without discrepancy" if latent is not None else ""
         what = f"95 % of the posterior{which}" if label else None
-        low, high = curve.interval[:, :, channel]
-        axes.fill_between(curve.angle, low, high, color=colour, alpha=0.3, linewidth=0.0, label=what, zorder=2.5)
+        low, high = interval[:, :, channel]
+        axes.fill_between(angle, low, high, color=colour, alpha=0.3, linewidth=0.0, label=what, zorder=2.5)
 
 
 def maps_picture(fit: "Fit", channel: int = 0) -> Figure | None:
