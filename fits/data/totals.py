@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from fits.data.geometry import LIGHT_AZIMUTH, direction
-from fits.data.measurements import Floats, Measurements, Source, channel_names
+from fits.data.measurements import Floats, Measurements, channel_names
 from fits.data.spheres import Spheres
 
 Kind = Literal["reflectance", "transmittance", "unscattered"]
@@ -85,17 +85,14 @@ class Totals(Measurements):
             raise ValueError(f"sigma has nothing for {', '.join(sorted(missing))}")
         spreads = {kind: _columns("sigma", sigmas[kind], len(angles), *count) for kind in measured}
         wi = direction(angles, LIGHT_AZIMUTH)
-        kinds = [kind for kind in KINDS if kind in measured for _ in angles]
+        kinds = [kind for kind in KINDS if kind in measured for _ in angles]  # in the order of `measured`
         return cls(
             wi=np.tile(wi, (len(measured), 1)),
-            wo=np.concatenate(
-                [wi * (-1, -1, 1 if kind == "reflectance" else -1) for kind in KINDS if kind in measured]
-            ),
-            values=np.concatenate([measured[kind] for kind in KINDS if kind in measured]),
-            sigma=np.concatenate([spreads[kind] for kind in KINDS if kind in measured]),
+            wo=np.concatenate([wi * (-1, -1, 1 if kind == "reflectance" else -1) for kind in measured]),
+            values=np.concatenate(list(measured.values())),
+            sigma=np.concatenate(list(spreads.values())),
             mask=np.ones(len(kinds), bool),
             channels=names,
-            source=Source("", "memory"),
             kinds=tuple(kinds),
             spheres=spheres,
         )
