@@ -10,6 +10,8 @@ import pytest
 
 import layerjax as lj
 from layerjax._jacobian import MOST_PARAMETERS, MOST_SLOPES, few_parameters
+from layerjax.transport.adding_doubling.elements import linearize_element
+from layerjax.transport.adding_doubling.solve import Plan, _interface, _interface_step
 from tests.helpers.compilations import compiled_by
 
 TRANSPORT = lj.AddingDoubling(nodes=3, modes=2, ordinates=(2, 4))
@@ -144,6 +146,34 @@ def test_precision_is_that_of_the_directions(ruled):
     assert len(ruled) == 1
     assert found["base"].dtype == jnp.float64
     same(found, jax.grad(total("haze"))({"base": 0.4}), 1e-4)
+
+
+@pytest.mark.parametrize(("ior", "alpha"), [(1.5, 0.01), (0.8, 0.2)])
+def test_single_precision_derivatives_of_interfaces_are_right_to_single_precision(ior, alpha):
+    """They are differences in double precision. Differentiated in single precision they would be off by 5e-4."""
+    plan = Plan(nodes=6, modes=2, azimuths=None, ranks=None, multiple=False)
+    options = (plan, "ggx", True, "diffuse", 0)
+    cosines = np.array([1.0, 0.5, 0.1])
+    at = (1.0, float(np.float32(ior))), float(np.float32(alpha))
+
+    def linear(dtype):
+        numbers = jax.tree.map(lambda number: jnp.asarray(number, dtype), at)
+        along, found = jnp.asarray(cosines, dtype), []
+        jax.linearize(lambda ior: found.append(element(ior, numbers, along, dtype)) or ior, numbers[0][1])
+        return jax.tree.leaves(found[0].slopes)
+
+    def element(ior, numbers, along, dtype):
+        parameters = (numbers[0][0], ior), numbers[1]
+        return linearize_element(_interface, options, parameters, along, dtype, _interface_step)
+
+    for single, double in zip(linear(jnp.float32), linear(jnp.float64), strict=True):
+        assert single.dtype == jnp.float32
+        np.testing.assert_allclose(single, double, rtol=0.0, atol=1e-5 * float(jnp.max(jnp.abs(double))))
+
+
+@pytest.mark.parametrize(("ior", "alpha"), [(1.0, 0.2), (1.5, 1.0), (1.5, 1e-4)])
+def test_where_derivatives_are_one_sided_no_differences_are_taken(ior, alpha):
+    assert _interface_step(((1.0, ior), alpha)) is None
 
 
 def test_many_numbers_and_large_batches_are_differentiated_on_the_way_back():

@@ -8,10 +8,12 @@ product with them: no program has to be run backwards through quadratures.
 
 from collections.abc import Callable, Sequence
 from functools import partial, reduce
+from operator import itemgetter
 from typing import Any
 
 import equinox as eqx
 import jax
+import jax.experimental
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -21,6 +23,8 @@ from layerjax._devices import exact_products
 from layerjax._jacobian import primal
 from layerjax._numerics import broadcasting
 from layerjax.compiling import filter_jit, is_traced
+
+enable_x64: Any = getattr(jax if hasattr(jax, "enable_x64") else jax.experimental, "enable_x64")  # noqa: B009 (by version)
 
 Scalars = tuple[Array, ...]
 
@@ -70,8 +74,17 @@ Make = Callable[..., Any]
 """Gives the element of a function of options, parameters and constants: `build_element` or `compile_element`."""
 
 
+Step = Callable[[Any], float | None]
+"""Of known parameters: a step over which an element is smooth; None: it may not be."""
+
+
 def build_element(
-    function: Callable[..., Any], options: tuple[Any, ...], parameters: Any, constants: Any, dtype: Any
+    function: Callable[..., Any],
+    options: tuple[Any, ...],
+    parameters: Any,
+    constants: Any,
+    dtype: Any,
+    step: Step | None = None,
 ) -> Any:
     """The `element` of function(*options, parameters, constants)."""
     return element(partial(function, *options), parameters, constants, dtype)
@@ -94,10 +107,17 @@ class LinearElement(eqx.Module):
 
 
 def linearize_element(
-    function: Callable[..., Any], options: tuple[Any, ...], parameters: Any, constants: Any, dtype: Any
+    function: Callable[..., Any],
+    options: tuple[Any, ...],
+    parameters: Any,
+    constants: Any,
+    dtype: Any,
+    step: Step | None = None,
 ) -> LinearElement | None:
     """`compile_element` where `grad` or its like differentiates by known numbers, with the derivatives by these.
 
+    In single precision, where the element is smooth over a `step`, they are differences in double precision, which are
+    right to single precision: a program of values compiles in a fourth of the time that one of derivatives takes.
     None: there are too many scalars.
     """
     changing: list[int] = []
@@ -108,7 +128,53 @@ def linearize_element(
         count += size
     if count > MOST_SCALARS:
         return None
-    return _linearize(function, options, jax.tree.map(primal, parameters), constants, dtype, tuple(changing))
+    known = jax.tree.map(primal, parameters)
+    if step and changing and dtype == jnp.float32 and jax.default_backend() == "cpu" and not is_traced(constants):
+        length = step(known)
+        if length is not None:
+            return _by_differences(function, options, known, constants, tuple(changing), length)
+    return _linearize(function, options, known, constants, dtype, tuple(changing))
+
+
+def _by_differences(
+    function: Callable[..., Any],
+    options: tuple[Any, ...],
+    parameters: Any,
+    constants: Any,
+    changing: tuple[int, ...],
+    length: float,
+) -> LinearElement:
+    def widened(leaf: Any) -> Any:
+        return np.asarray(leaf, np.float64) if _is_number(leaf) else leaf
+
+    at, along = jax.tree.map(widened, (parameters, constants))
+    with enable_x64(True):
+        found = _differences(function, options, at, along, changing, jnp.asarray(length))
+    value, slopes = jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf), jnp.float32), found)
+    return LinearElement(value, slopes, changing)
+
+
+@filter_jit
+@exact_products
+def _differences(
+    function: Callable[..., Any],
+    options: tuple[Any, ...],
+    parameters: Any,
+    constants: Any,
+    changing: tuple[int, ...],
+    length: Array,
+) -> tuple[Any, Any]:
+    """The value, and central differences by some of the scalars, on a leading axis."""
+    scalars, filled = _scalars_of(parameters, jnp.float64)
+    units = length * np.eye(len(scalars))[list(changing)]
+    points = jnp.stack(scalars) + jnp.concatenate([jnp.zeros((1, len(scalars))), units, -units])
+    found = jax.lax.map(lambda point: function(*options, filled(tuple(point)), constants), points)
+    count = len(changing)
+
+    def slopes(leaf: Array) -> Array:
+        return (leaf[1 : count + 1] - leaf[count + 1 :]) / (2.0 * length)
+
+    return jax.tree.map(itemgetter(0), found), jax.tree.map(slopes, found)
 
 
 def record(make: Make, elements: list[Any]) -> Make:
@@ -125,7 +191,7 @@ def replay(elements: Sequence[LinearElement]) -> Make:
     """A `Make` that returns the elements which another one has recorded, as functions of their scalars."""
     left = iter(elements)
 
-    def make(_: Callable[..., Any], __: tuple[Any, ...], parameters: Any, ___: Any, dtype: Any) -> Any:
+    def make(function: Any, options: Any, parameters: Any, constants: Any, dtype: Any, step: Any = None) -> Any:
         one = next(left)
         scalars, _ = _scalars_of(parameters, dtype)
         return _linear(one.value, one.slopes, tuple(scalars[k] for k in one.changing)) if one.changing else one.value

@@ -35,6 +35,10 @@ from layerjax.transport.known_directions import Known, KnownDirections
 MANY = 3
 """Interfaces of a kind from which on they share a program."""
 
+DISTINCT, LEAST_ALPHA, MOST_ALPHA, STEP = 0.02, 2e-4, 0.99, 6e-6
+"""Differences stand for derivatives where indices are as far apart, of the least, and alpha within these two: by a step
+of this share of alpha, the root of the third order of the rounding in double precision."""
+
 
 class Plan(eqx.Module):
     """What is decided before tracing. azimuths: ordinates in azimuth, or None for Fourier modes."""
@@ -153,19 +157,19 @@ def _interfaces(
     for region, layer in enumerate(interfaces):
         leaves = stack.base is None and 1 < region + 1 == len(interfaces)
         if requested is not None and (layer is stack.layers[0] or leaves):
-            options = plan, layer.distribution, not leaves, next_event, dtype, region
+            options = plan, layer.distribution, not leaves, next_event, region
             along = requested.below if leaves else requested.above
-            layers[region] = make(_interface, options, (indices, layer.alpha), along, dtype)
+            layers[region] = make(_interface, options, (indices, layer.alpha), along, dtype, _interface_step)
         else:
             by_kind[layer.distribution, not leaves].append(region)
     for kind, regions in by_kind.items():
         alphas = [jnp.asarray(interfaces[region].alpha, dtype) for region in regions]
         if len(regions) < MANY:
             for region, alpha in zip(regions, alphas, strict=True):
-                options = plan, *kind, next_event, dtype, region
-                layers[region] = make(_interface, options, (indices, alpha), None, dtype)
+                options = plan, *kind, next_event, region
+                layers[region] = make(_interface, options, (indices, alpha), None, dtype, _interface_step)
         else:
-            build = partial(_numbered_interface, plan, *kind, next_event, dtype)
+            build = partial(_numbered_interface, plan, *kind, next_event)
             together = jax.lax.map(
                 lambda each, build=build: element(build, (indices, each[1]), each[0], dtype),
                 (jnp.asarray(regions), jnp.stack(alphas)),
@@ -179,12 +183,12 @@ def _interface(
     distribution: Distribution,
     enters: bool,
     next_event: NextEvent,
-    dtype: Any,
     region: int | Array,
-    numbers: Any,
+    numbers: tuple[Scalars, Array],
     requested: Array | None,
 ) -> Layer:
     indices, alpha = numbers
+    dtype = indices[0].dtype
     grid = make_grid(indices, plan.ranks, plan.nodes, dtype)
     above, below = (_region(grid, place) for place in (region, region + 1))
     outside = None if requested is None else requested_region(requested, (above if enters else below).ior)
@@ -203,10 +207,27 @@ def _interface(
 
 
 def _numbered_interface(
-    plan: Plan, distribution: Distribution, enters: bool, next_event: NextEvent, dtype: Any, numbers: Any, region: Array
+    plan: Plan,
+    distribution: Distribution,
+    enters: bool,
+    next_event: NextEvent,
+    numbers: tuple[Scalars, Array],
+    region: Array,
 ) -> Layer:
     """An interface under a region whose number is traced."""
-    return _interface(plan, distribution, enters, next_event, dtype, region, numbers, None)
+    return _interface(plan, distribution, enters, next_event, region, numbers, None)
+
+
+def _interface_step(numbers: tuple[Scalars, Array]) -> float | None:
+    """See `linearize_element`: an interface varies with alpha and the indices like a lobe does, over its width.
+
+    None where indices meet or the width ends: there its derivatives are one-sided.
+    """
+    indices, width = np.asarray(numbers[0], float), float(numbers[1])
+    steps = np.diff(np.sort(indices)) / np.min(indices)
+    if np.min(steps) < DISTINCT or not LEAST_ALPHA < width < MOST_ALPHA:
+        return None
+    return STEP * width
 
 
 def _region(grid: Grid, place: int | Array) -> Region:
