@@ -3,9 +3,8 @@
 Names are imported when they are first used: `import fits` loads neither arviz, matplotlib nor a solver.
 """
 
-from typing import TYPE_CHECKING
-
-from fits._lazy import directory_of, names_from
+import importlib
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from fits.any_report import report as report
@@ -77,77 +76,56 @@ if TYPE_CHECKING:
     from fits.structure_search import read_library as read_library
     from fits.structure_search import search as search
 
-_HOMES = {
-    "Average": "prediction.average",
-    "average": "prediction.average",
-    "Comparison": "prediction.compare",
-    "compare": "prediction.compare",
-    "ComparisonOptions": "prediction.options",
-    "Evidence": "prediction.importance",
-    "evidence": "prediction.importance",
-    "ExportReport": "exports.export",
-    "export": "exports.export",
-    "Fit": "optimise.result",
-    "FitOptions": "optimise.options",
-    "fit_map": "maps.fit_map",
-    "FittedMap": "maps.store",
-    "open_map": "maps.store",
-    "MapOptions": "maps.options",
-    "SpatialPrior": "maps.options",
-    "ModelScore": "prediction.cross_validation",
-    "read": "data.reading",
-    "ReadOptions": "data.reading",
-    "write_csv": "data.formats.csv",
-    "read_slab": "data.formats.rxt",
-    "Slab": "data.formats.rxt",
-    "Geometry": "data.geometry",
-    "slices": "data.geometry",
-    "Direction": "optimise.uncertainty",
-    "Discrepancy": "problem.discrepancy",
-    "Instrument": "problem.instrument",
-    "Joint": "problem.problem",
-    "Noise": "problem.noise",
-    "PowerLaw": "problem.parameters",
-    "Measurements": "data.measurements",
-    "Sphere": "data.spheres",
-    "Spheres": "data.spheres",
-    "Totals": "data.totals",
-    "fit": "optimise.fit",
-    "Free": "problem.parameters",
-    "LogNormal": "problem.parameters",
-    "LogUniform": "problem.parameters",
-    "Normal": "problem.parameters",
-    "Uniform": "problem.parameters",
-    "Mode": "sampling.posterior",
-    "Posterior": "sampling.posterior",
-    "SamplerOptions": "sampling.options",
-    "Prediction": "prediction.predict",
-    "Scores": "prediction.predict",
-    "scores": "prediction.predict",
-    "predict": "prediction.predict",
-    "sample": "sampling.sample",
-    "Candidate": "structure_search",
-    "Search": "structure_search",
-    "SearchOptions": "structure_search",
-    "search": "structure_search",
-    "Library": "structure_search",
-    "default_library": "structure_search",
-    "read_library": "structure_search",
-    "cross_validate": "prediction.cross_validation",
-    "fit_files": "batch",
-    "FittedFiles": "batch",
-    "Problem": "problem.problem",
-    "render": "reports.render",
-    "report": "any_report",
-    "ReportOptions": "reports.verdicts",
-    "load_fit": "reports.results",
-    "load_posterior": "reports.results",
-    "save_fit": "reports.results",
-    "simulate": "problem.simulate",
-    "read_problem": "problem.stack_file",
-    "write_problem": "problem.stack_file",
+_NAMES = {
+    "any_report": "report",
+    "batch": "FittedFiles fit_files",
+    "data.formats.csv": "write_csv",
+    "data.formats.rxt": "Slab read_slab",
+    "data.geometry": "Geometry slices",
+    "data.measurements": "Measurements",
+    "data.reading": "ReadOptions read",
+    "data.spheres": "Sphere Spheres",
+    "data.totals": "Totals",
+    "exports.export": "ExportReport export",
+    "maps.fit_map": "fit_map",
+    "maps.options": "MapOptions SpatialPrior",
+    "maps.store": "FittedMap open_map",
+    "optimise.fit": "fit",
+    "optimise.options": "FitOptions",
+    "optimise.result": "Fit",
+    "optimise.uncertainty": "Direction",
+    "prediction.average": "Average average",
+    "prediction.compare": "Comparison compare",
+    "prediction.cross_validation": "ModelScore cross_validate",
+    "prediction.importance": "Evidence evidence",
+    "prediction.options": "ComparisonOptions",
+    "prediction.predict": "Prediction Scores predict scores",
+    "problem.discrepancy": "Discrepancy",
+    "problem.instrument": "Instrument",
+    "problem.noise": "Noise",
+    "problem.parameters": "Free LogNormal LogUniform Normal PowerLaw Uniform",
+    "problem.problem": "Joint Problem",
+    "problem.simulate": "simulate",
+    "problem.stack_file": "read_problem write_problem",
+    "reports.render": "render",
+    "reports.results": "load_fit load_posterior save_fit",
+    "reports.verdicts": "ReportOptions",
+    "sampling.options": "SamplerOptions",
+    "sampling.posterior": "Mode Posterior",
+    "sampling.sample": "sample",
+    "structure_search": "Candidate Library Search SearchOptions default_library read_library search",
 }
+"""The public names of each module."""
 
+_HOMES = {name: module for module, names in _NAMES.items() for name in names.split()}
 __all__ = list(_HOMES)
-__getattr__ = names_from(__name__, _HOMES)
-__dir__ = directory_of(__name__, _HOMES)
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *_HOMES})

@@ -3,9 +3,13 @@
 import operator
 from collections.abc import Callable, Sequence
 from functools import reduce
+from typing import Any
 
+import jax
 import jax.numpy as jnp
 from jax import Array
+
+from layerjax._numerics import unstacked
 
 Channels = tuple[Array, ...]
 """One array for all channels, or one for each."""
@@ -29,6 +33,24 @@ def count(*values: Sequence[Array]) -> int:
 def each(function: Callable[..., Array], *values: Sequence[Array]) -> Channels:
     """The function of the values of each channel; computed once where every value serves all channels."""
     return tuple(function(*(pick(value, c) for value in values)) for c in range(max(1, count(*values))))
+
+
+def by_channel(function: Callable[[Any], Array], tree: Any) -> Channels:
+    """The function of a tree of parameters, of one channel: what differs between channels is an axis of one program.
+
+    Without parameters that do, computed once.
+    """
+    leaves, structure = jax.tree.flatten(tree)
+    differing = [leaf for leaf in leaves if jnp.ndim(leaf)]
+    if not differing:
+        return (function(tree),)
+
+    def of_one(numbers: list[Array]) -> Array:
+        left = iter(numbers)
+        return function(jax.tree.unflatten(structure, [next(left) if jnp.ndim(leaf) else leaf for leaf in leaves]))
+
+    channels = max(len(leaf) for leaf in differing)
+    return tuple(unstacked(jax.vmap(of_one)([jnp.broadcast_to(leaf, channels) for leaf in differing])))
 
 
 def times(*factors: Sequence[Array]) -> Channels:

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from fits.optimise.levenberg_marquardt import COST_TOLERANCE, descend
 from fits.optimise.multi_start import MOST_STEPS, start_points
-from fits.optimise.resolution import at_start
+from fits.optimise.resolution import resolutions
 from fits.problem.compilation import cores, in_shares
 from fits.problem.model import Model
 from fits.problem.problem import Problem
@@ -46,7 +46,9 @@ def fit_many(problem: Problem, values: ArrayLike, *, starts: int = 1, seed: int 
     Raises:
         ValueError: values of another shape.
     """
-    values, problem = np.asarray(values, float), at_start(problem)
+    values, known = np.asarray(values, float), resolutions(problem)
+    if known is not None and known.open:  # the resolution that the start values ask for
+        problem = replace(problem, transport=known.chosen)
     expected = problem.model.values.shape
     if values.ndim != 3 or values.shape[1:] != expected:
         raise ValueError(f"values has shape {values.shape}; it must be (K, {expected[0]}, {expected[1]})")

@@ -33,7 +33,15 @@ from fits.optimise.multi_start import (
     unit_of,
 )
 from fits.optimise.options import DEFAULT, FitOptions
-from fits.optimise.resolution import Accuracy, has_rays, leaves_rays_open, refined, resolutions, rings_for_starts
+from fits.optimise.resolution import (
+    FAR_RINGS,
+    Accuracy,
+    has_rays,
+    leaves_rays_open,
+    refined,
+    resolutions,
+    rings_of_lobes,
+)
 from fits.optimise.result import OUTCOMES, Fit, Minimum, WithoutDiscrepancy
 from fits.optimise.uncertainty import UNCONSTRAINED_BEYOND
 from fits.problem.instrument import Instrument
@@ -224,7 +232,12 @@ def _fit_from(
     open_rays = {name for name, one in problem.problems.items() if leaves_rays_open(one)}
     coarse = {name: replace(problem.problems[name], transport=one.far) for name, one in known.items() if one.open}
     problem = problem.with_problems(coarse)
-    problem = problem.with_problems({name: rings_for_starts(problem.problems[name]) for name in open_rays})
+    for name in open_rays:
+        one = problem.problems[name]
+        rings = min(rings_of_lobes(one, one.start), FAR_RINGS)
+        problem = problem.with_problems(
+            {name: replace(one, instrument=replace(cast(Any, one.instrument), rings=rings))}
+        )
     if run.screen:
         ends = screened_starts(problem, points)
     elif run.checkpoint is None:
@@ -244,10 +257,30 @@ def _fit_from(
 
 def _result(at: Optimum, accuracy: Accuracy | None, run: _Run, without: Mapping[str, WithoutDiscrepancy]) -> Fit:
     """The fit of an optimum: values, errors, minima, and its status in words."""
-    problem, lowest, found, options = at.problem, at.lowest, at.uncertainty, run.options
+    problem, lowest, found, options, total = at.problem, at.lowest, at.uncertainty, run.options, len(at.ends)
     at_bound = tuple(name for name, held in zip(problem.names, found.at_bound, strict=True) if held)
     minima, outcomes = _minima(problem, at, options)
     equivalent = options.equivalent_cost * at.excess
+    alternatives = tuple(minimum for minimum in minima[1:] if minimum.cost - lowest.cost < equivalent)
+    status = [
+        f"converged; {outcomes['best minimum']} of {total} starts converged to the best minimum"
+        if lowest.converged
+        else f"not converged: the lowest of {total} starts did not; these are the best values seen"
+    ]
+    others = {word: outcomes[key] for key, word in OUTCOMES.items() if key != "best minimum"}
+    status += [f"{count} of {total} starts {word}" for word, count in others.items() if count]
+    if at_bound:
+        status.append(f"at a bound: {', '.join(at_bound)}; the errors of the others hold with them kept there")
+    if alternatives:
+        words = f"{len(alternatives)} more local minima fit equally well"
+        status.append(f"errors are conditional on this local minimum; {words}")
+    if problem.objective != "likelihood":
+        words = "the errors are scaled by its scatter, no posterior"
+        status.append(f"objective {problem.objective} is no likelihood: {words}")
+    elif any(one.noise_is_assumed for one in problem.problems.values()):
+        status.append(f"a noise of {100.0 * DEFAULT_RELATIVE:g} % of the model's value was assumed, none is stated")
+    status += ["L-BFGS-B improved on Levenberg-Marquardt"] if at.improved else []
+    status += [] if accuracy is None else [accuracy.words]
     result = Fit(
         problem=cast(Problem, problem),  # or a `Joint`, of whose data sets `Fit.part` says more
         vector=lowest.vector,
@@ -256,13 +289,13 @@ def _result(at: Optimum, accuracy: Accuracy | None, run: _Run, without: Mapping[
         cost=lowest.cost,
         at_bound=at_bound,
         converged=lowest.converged,
-        status="",
+        status="; ".join(status),
         iterations=lowest.steps,
         condition_number=found.condition_number,
         unidentified=found.unidentified,
         insensitive=found.insensitive,
         minima=minima,
-        alternatives=tuple(minimum for minimum in minima[1:] if minimum.cost - lowest.cost < equivalent),
+        alternatives=alternatives,
         settings={"starts": run.starts, "seed": run.seed, **asdict(options)},
         start_outcomes=outcomes,
         numerical_error=None if accuracy is None else accuracy.error,
@@ -270,9 +303,6 @@ def _result(at: Optimum, accuracy: Accuracy | None, run: _Run, without: Mapping[
         without_discrepancy=without.get(""),
         without_discrepancy_parts={name: one for name, one in without.items() if name},
     )
-    notes = ["L-BFGS-B improved on Levenberg-Marquardt"] if at.improved else []
-    notes += [] if accuracy is None else [accuracy.words]
-    result = replace(result, status="; ".join((*_status(result), *notes)))
     if np.all(np.isfinite(at.predicted)):  # to compute it again, another program would be compiled
         vars(result)["predicted"] = at.predicted
     return result
@@ -322,34 +352,3 @@ def _minima(problem: FittingProblem, at: Optimum, options: FitOptions) -> tuple[
         for leader, count in zip(leaders, counts, strict=True)
     )
     return minima, outcomes
-
-
-def _status(fit: Fit) -> list[str]:
-    total, reached = sum(fit.start_outcomes.values()), fit.start_outcomes["best minimum"]
-    words = [
-        f"converged; {reached} of {total} starts converged to the best minimum"
-        if fit.converged
-        else f"not converged: the lowest of {total} starts did not; these are the best values seen"
-    ]
-    words += [
-        f"{fit.start_outcomes[key]} of {total} starts {word}"
-        for key, word in OUTCOMES.items()
-        if key != "best minimum" and fit.start_outcomes[key]
-    ]
-    if fit.at_bound:
-        words.append(f"at a bound: {', '.join(fit.at_bound)}; the errors of the others hold with them kept there")
-    if fit.insensitive:
-        words.append(f"insensitive, with no effect on the data: {', '.join(fit.insensitive)}")
-    if fit.unidentified:
-        words.append(f"{len(fit.unidentified)} direction(s) in the space of parameters are not identified")
-    if fit.alternatives:
-        words.append(
-            f"errors are conditional on this local minimum; {len(fit.alternatives)} more local minima fit equally well"
-        )
-    if fit.is_posterior and any(problem.noise_is_assumed for problem in fit.problem.problems.values()):
-        words.append(f"a noise of {100.0 * DEFAULT_RELATIVE:g} % of the model's value was assumed, none is stated")
-    if not fit.is_posterior:
-        words.append(
-            f"objective {fit.problem.objective} is no likelihood: the errors are scaled by its scatter, no posterior"
-        )
-    return words

@@ -2,15 +2,12 @@
 
 import math
 
-import jax.numpy as jnp
 import numpy as np
-from numpy.typing import NDArray
 
 import layerjax as lj
 from fits.data.measurements import Measurements
 from fits.data.scans import in_plane, scans, signed_angle
 from fits.optimise.result import Fit
-from fits.optimise.uncertainty import local_information
 from layerjax.mixture import stacks_by_name
 
 HALF = {"ggx": math.sqrt(math.sqrt(2.0) - 1.0), "vmf": math.sqrt(math.log(2.0))}
@@ -40,38 +37,6 @@ def instrument_limits(fit: Fit) -> dict[str, float]:
         if name in fit.values and fit.values[name] < least:
             found[name] = least
     return found
-
-
-def limited_with(fit: Fit) -> dict[str, tuple[str, float]]:
-    """Other parameters that what is not resolved limits: the roughness that each moves with, and how far.
-
-    A roughness that is limited may be anything up to the least that could be seen (`instrument_limits`). What moves by
-    more than its standard error when that is put in its place, by the information in the data about both, is known no
-    better: it counts in standard errors, by the roughness that moves it most.
-    """
-    limited: dict[str, tuple[str, float]] = {}
-    limits, names = instrument_limits(fit), list(fit.values)
-    for roughness, least in limits.items():
-        moves = np.abs(_slopes(fit, names.index(roughness)) * (least - fit.values[roughness]))
-        for name, move, error in zip(names, moves, fit.errors, strict=True):
-            if name not in limits and 0.0 < error < move and move / error > limited.get(name, ("", 0.0))[1]:
-                limited[name] = (roughness, float(move / error))
-    return limited
-
-
-def _slopes(fit: Fit, place: int) -> NDArray[np.float64]:
-    """How the best values of all parameters, (P,), change with one that is held."""
-    spread = fit.covariance[place, place]
-    if spread > 0.0 and math.isfinite(spread):
-        return fit.covariance[:, place] / spread
-    # at a bound it has no errors of its own
-    box, vector = fit.problem.model.box, jnp.asarray(fit.vector)
-    width = np.asarray(box.slope(vector), float)
-    root = local_information(fit.problem, np.asarray(box.to_unit(vector), float))[0] / width
-    others = np.flatnonzero(np.isfinite(fit.errors) & (np.arange(len(width)) != place))
-    slopes = np.zeros(len(width))
-    slopes[others] = -np.linalg.lstsq(root[:, others], root[:, place], rcond=None)[0]
-    return slopes
 
 
 def finest_step(data: Measurements) -> float:

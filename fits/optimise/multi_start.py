@@ -20,7 +20,7 @@ from scipy.stats import qmc
 import layerjax
 from fits.optimise.levenberg_marquardt import COST_TOLERANCE, ROUGH_TOLERANCE, Descent, descent, evaluate_at
 from fits.optimise.uncertainty import Uncertainty, uncertainty
-from fits.problem.compilation import cores
+from fits.problem.compilation import cores, on_all_cores
 from fits.problem.model import Model
 from fits.problem.problem import FittingProblem
 from fits.progress import Progress
@@ -29,17 +29,15 @@ from layerjax._numerics import broadcasting
 
 Floats = NDArray[np.float64]
 
-MOST_STEPS = 200
-MOST_ROUNDS = 20
-LBFGSB_STEPS, LBFGSB_TOLERANCE = 500, 1e-12
+MOST_STEPS, MOST_ROUNDS = 200, 20
+"""Of a start, and how many times so many, while a round of them gains `LEAST_GAIN`."""
+LEAST_GAIN, LEAST_RELATIVE_GAIN = 1e-3, 1e-6
+"""In the log-posterior; and for a named objective, as a share of the cost."""
 EARLY, FRONT = 20, 3
 """Steps, with sigma held and with it free, after which starts are screened, and how many of them are continued."""
-LEAST_GAIN = 1e-3
-"""A start that reached the maximum of steps is continued while a round of them gains this in the log-posterior."""
-LEAST_STEP_GAIN = 1e-5
-"""The check by L-BFGS-B ends where a step of it gains less than this in the log-posterior."""
-LEAST_RELATIVE_GAIN = 1e-6
-"""The same for a named objective, as a share of the cost."""
+LBFGSB_STEPS, LBFGSB_TOLERANCE, LEAST_STEP_GAIN = 500, 1e-12, 1e-5
+"""The check by L-BFGS-B ends after so many steps; where the gradient of a named objective is below the second; where a
+step gains less than the last in the log-posterior."""
 
 
 class StartOutcome(NamedTuple):
@@ -72,15 +70,15 @@ def multi_start(
     """Where each of the points (starts, P) in the unit box ends, roughly; those that are in the store are not run."""
     ends: dict[int, StartOutcome] = {}
 
-    def ended(index: int, end: StartOutcome, new: bool = True) -> None:
+    def ended(index: int, end: StartOutcome) -> None:
         ends[index] = end
-        if store is not None and new:
+        if store is not None and store.get(f"start {index}") is None:
             store.put(f"start {index}", end._asdict())
         progress("fit", len(ends), len(points), f"best cost {min(end.cost for end in ends.values()):.6g}")
 
     for index in range(len(points)):
         if store is not None and (stored := store.get(f"start {index}")) is not None:
-            ended(index, StartOutcome(**stored), new=False)
+            ended(index, StartOutcome(**stored))
     left = [index for index in range(len(points)) if index not in ends]
     for index in left[:1]:  # alone: it compiles the program, which keeps one core busy
         ended(index, rough_descent(problem, points[index]))
@@ -121,12 +119,10 @@ def screened_starts(problem: FittingProblem, points: Floats) -> list[StartOutcom
         further = rough_descent(problem, unit_of(problem, end.vector), fresh=False)
         return further._replace(steps=end.steps + further.steps)
 
-    first = early(points[0])  # alone: it compiles the program, which keeps one core busy
-    with ThreadPoolExecutor(cores()) as pool:
-        ends = [first, *pool.map(early, points[1:])]
-        front = np.argsort([end.cost for end in ends])[:FRONT]
-        for place, end in zip(front, pool.map(onward, [ends[place] for place in front]), strict=True):
-            ends[place] = end
+    ends = [early(points[0]), *on_all_cores(early, points[1:])]  # the first alone: it compiles the program
+    front = np.argsort([end.cost for end in ends])[:FRONT]
+    for place, end in zip(front, on_all_cores(onward, [ends[place] for place in front]), strict=True):
+        ends[place] = end
     return ends
 
 

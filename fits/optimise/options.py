@@ -1,11 +1,10 @@
 """Tolerances and thresholds of a fit, with the values that they have by default."""
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Any
 
-from layerjax._checks import in_short
+from layerjax._checks import require_number
 
 
 @dataclass(frozen=True)
@@ -35,9 +34,7 @@ class FitOptions:
 
     def __post_init__(self) -> None:
         for entry in fields(self):
-            value = getattr(self, entry.name)
-            if not (isinstance(value, int | float) and math.isfinite(value) and value > 0.0):
-                raise ValueError(f"FitOptions.{entry.name} is {in_short(value)}; it must be a number above 0")
+            require_number(f"FitOptions.{entry.name}", getattr(self, entry.name), 0.0, open_ends=True)
 
 
 DEFAULT = FitOptions()

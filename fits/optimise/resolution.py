@@ -4,11 +4,11 @@ A resolution that is left open is that of the start values where starts run, but
 the data. At the optimum it is compared with finer ones, by values alone, until they agree to a tenth of the noise: only
 then are the minima that may be the best, or as good as it, fitted again, as programs of a finer resolution take seconds
 to compile. A resolution that is given is compared with a finer one, and stays. The rays that stand for the cones of an
-instrument are chosen in the same way.
+instrument are those that the lobe asks for that was found.
 """
 
 import warnings
-from collections.abc import Mapping, Set
+from collections.abc import Callable, Mapping, Set
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple, cast
 
@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 import layerjax as lj
 from fits.optimise.multi_start import Optimum, StartOutcome, polish, rough_descent, unit_of
 from fits.optimise.options import FitOptions
-from fits.problem.apertures import most_rings
 from fits.problem.instrument import rings_for
 from fits.problem.model import Model
 from fits.problem.problem import FittingProblem, Problem
@@ -40,17 +39,12 @@ FINEST_NODES, FINEST_MODES, FINEST_COSINES = 48, 96, 16
 MINOR_SHARE = 0.5
 """Of the numerical error that is allowed: left to nodes or modes where the other is what has to be finer."""
 
-ENOUGH_OF_PEAK, NO_BETTER = 1e-3, 0.3
-"""Error of the rays, in units of the largest measurement, that no fit needs to fall below; and the share of an error
-that a ring more may leave: more costs more than it gains, and of a lobe it leaves a fifth."""
-
 LEAST_SCATTER = 0.01
 """Of the data's root mean square: less scatter about a named objective counts as this, so that an error of a thousandth
 is enough, which `AddingDoubling` aims at."""
 
 SAME_OUTCOME, MOST_MINIMA = 0.01, 8
-"""Of the box: ends that are closer in every parameter are fitted again as one; and the most that are, other than those
-that turn out to be the best."""
+"""Of the box: ends that are closer in every parameter are fitted again as one; and the most that are."""
 
 Floats = NDArray[np.float64]
 
@@ -151,38 +145,24 @@ def resolutions(problem: Problem) -> Resolutions | None:
     return Resolutions(given, chosen(model.build(start).stack, given), tilted)
 
 
-def at_start(problem: Problem) -> Problem:
-    """The problem with the resolution that its start values ask for, if none is given."""
-    known = resolutions(problem)
-    return replace(problem, transport=known.chosen) if known is not None and known.open else problem
+def error_between(
+    problem: Problem, transport: lj.AddingDoubling, vector: Floats, predicted: Floats
+) -> Callable[[lj.AddingDoubling, lj.AddingDoubling], float]:
+    """Largest difference between two resolutions, in standard deviations of the data; NaN if one is not finite.
 
+    predicted: by the problem with the vector (P,) at the resolution of `transport`. Each other is computed once, and
+    values count in the measure of a named objective if it is one.
+    """
+    values, sd = {transport: predicted}, spread(problem, vector, predicted)
 
-class Values:
-    """What a problem predicts with one vector (P,) at several resolutions, of which that at its own is known."""
+    def measured(one: lj.AddingDoubling) -> Floats:
+        if one not in values:
+            values[one] = np.asarray(replace(problem, transport=one).predict(vector), float)
+        if problem.objective == "likelihood":
+            return values[one]
+        return np.asarray(problem.call(Model.standardised_at, vector, values[one]), float)
 
-    def __init__(self, problem: Problem, transport: lj.AddingDoubling, vector: Floats, predicted: Floats):
-        self.problem, self.vector = problem, vector
-        self._known = {transport: predicted}
-        self._spread = spread(problem, vector, predicted)
-
-    @property
-    def count(self) -> int:
-        """At how many resolutions."""
-        return len(self._known)
-
-    def error(self, transport: lj.AddingDoubling, other: lj.AddingDoubling) -> float:
-        """Largest difference between two resolutions, in standard deviations of the data; NaN if one is not finite."""
-        near, far = (self._measured(one) for one in (transport, other))
-        return float(np.max(np.abs(near - far) / self._spread))
-
-    def _measured(self, transport: lj.AddingDoubling) -> Floats:
-        """Values, in the measure of a named objective if it is one."""
-        if transport not in self._known:
-            self._known[transport] = np.asarray(replace(self.problem, transport=transport).predict(self.vector), float)
-        predicted = self._known[transport]
-        if self.problem.objective == "likelihood":
-            return predicted
-        return np.asarray(self.problem.call(Model.standardised_at, self.vector, predicted), float)
+    return lambda one, other: float(np.max(np.abs(measured(one) - measured(other)) / sd))
 
 
 def spread(problem: Problem, vector: Floats, predicted: Floats) -> Floats:
@@ -199,15 +179,12 @@ def spread(problem: Problem, vector: Floats, predicted: Floats) -> Floats:
 
 
 def needed_resolution(
-    known: Resolutions, transport: lj.AddingDoubling, values: Values, allowed: float, progress: Progress
+    known: Resolutions,
+    transport: lj.AddingDoubling,
+    error: Callable[[lj.AddingDoubling, lj.AddingDoubling], float],
+    allowed: float,
 ) -> tuple[lj.AddingDoubling, float, bool]:
     """The coarsest resolution from this one on that is fine enough, its error, and whether none is finer."""
-
-    def error(one: lj.AddingDoubling, other: lj.AddingDoubling) -> float:
-        found = values.error(one, other)
-        progress("numerical error", values.count, None, f"{found:.2g} sigma at {known.in_words(transport)}")
-        return found
-
     finer = known.finer(transport)
     if finer is None:
         return transport, error(known.coarser(transport), transport), True
@@ -241,53 +218,17 @@ def with_rings(problem: Problem, rings: int) -> Problem:
     return replace(problem, instrument=replace(problem.instrument, rings=rings))
 
 
-def rings_for_starts(problem: Problem) -> Problem:
-    """The problem with the rings that its start values ask for, if it gives none."""
-    if not leaves_rays_open(problem):
-        return problem
-    return with_rings(problem, min(_rings_of_lobes(problem, problem.start), FAR_RINGS))
-
-
-def needed_rings(
-    problem: Problem, vector: Floats, predicted: Floats, is_open: bool, allowed: float, progress: Progress
-) -> tuple[int, float]:
-    """Rings from those on that the problem has: so many that more of them, with these parameters, change too little;
-    and the numerical error there, in standard deviations.
-
-    predicted: by the problem, (N, C). is_open: False: those that it has, with their error. allowed: that error.
-    """
-    assert problem.instrument is not None
-    rings, values = problem.instrument.rings or 1, predicted
-    most = most_rings(problem.instrument.source_aperture, problem.instrument.detector_aperture)
-    sigma, peak = spread(problem, vector, predicted), np.max(np.abs(predicted))
-    wanted = min(_rings_of_lobes(problem, vector), most)
-    if is_open and wanted > rings:
-        rings = wanted
-        values = np.asarray(with_rings(problem, rings).predict(vector), float)
-    before = np.inf
-    while True:
-        other = with_rings(problem, max(rings, wanted)).with_other_rays()
-        apart = np.abs(values - np.asarray(other.predict(vector), float))
-        error = float(np.max(apart / sigma))
-        progress("numerical error", rings, None, f"{error:.2g} sigma at {_rings_in_words(rings)}")
-        if error > NO_BETTER * before:  # not of the lobe, but of cones that the horizon cuts, say
-            return rings - 1, before
-        if not is_open or rings == most or (error <= allowed and np.max(apart) <= ENOUGH_OF_PEAK * peak):
-            return rings, error
-        rings, before = rings + 1, error
-        values = np.asarray(with_rings(problem, rings).predict(vector), float)
-
-
-def _rings_of_lobes(problem: Problem, vector: Floats) -> int:
-    """Rings that the lobes of the stack ask for with this vector (P,)."""
+def rings_of_lobes(problem: Problem, vector: Floats) -> int:
+    """Rings of rays a cone that the lobes of the stack ask for with this vector (P,)."""
     parts, data = problem.build(vector), problem.data.used()
     assert problem.instrument is not None
-    assert parts.instrument is not None
     return rings_for(problem.instrument, parts.instrument, parts.stack, data.wi, data.wo)
 
 
-def _rings_in_words(rings: int) -> str:
-    return f"{rings} ring{'s' if rings > 1 else ''} of rays a cone"
+def error_of_rays(problem: Problem, vector: Floats, predicted: Floats) -> float:
+    """What other rays for the cones change of what a vector predicts at most, in standard deviations of the data."""
+    other = np.asarray(problem.with_other_rays().predict(vector), float)
+    return float(np.max(np.abs(predicted - other) / spread(problem, vector, predicted)))
 
 
 # ---- refinement of an optimum ----
@@ -299,17 +240,6 @@ class Accuracy(NamedTuple):
     resolution: str
     error: float
     words: str
-
-    @classmethod
-    def of(cls, resolution: str, error: float, finest: bool, is_open: bool) -> "Accuracy":
-        """finest: the resolution is the finest tried, so that the error is that of a coarser one."""
-        if not np.isfinite(error):
-            words = f"not known at {resolution}"
-        elif finest:
-            words = f"up to {error:.2g} sigma at {resolution}{', the finest tried' if is_open else ''}"
-        else:
-            words = f"{error:.2g} sigma at most at {resolution}{'' if is_open else ', as given'}"
-        return cls(resolution, error, words)
 
 
 def refined(
@@ -328,35 +258,37 @@ def refined(
         accuracies: dict[str, Accuracy] = {}
         changed: dict[str, Problem] = {}
         for name, predicted in at.problem.shares(at.predicted).items():
-            problem, parts = at.problem.problems[name], []
-            vector, needed = at.lowest.vector[list(at.problem.places(name))], problem
+            problem = at.problem.problems[name]
+            vector, needed, errors, words = at.lowest.vector[list(at.problem.places(name))], problem, [], []
             if (one := known.get(name)) is not None:
                 own = transport_of(problem, one)
-                values = Values(problem, own, vector, predicted)
-                transport, error, finest = needed_resolution(one, own, values, options.numerical_error, progress)
-                parts.append(Accuracy.of(one.in_words(own), error, finest, one.open))
+                progress("numerical error", 0, None, f"at {one.in_words(own)}")
+                between = error_between(problem, own, vector, predicted)
+                transport, error, finest = needed_resolution(one, own, between, options.numerical_error)
                 if one.open and transport != own:
                     needed = replace(needed, transport=transport)
+                errors.append(error)
+                words.append(_error_in_words(one.in_words(own), error, finest, one.open))
             if has_rays(problem):
-                is_open = name in open_rays
-                rings, error = needed_rings(problem, vector, predicted, is_open, options.numerical_error, progress)
-                parts.append(Accuracy.of(_rings_in_words(rings), error, False, is_open))
-                if rings != (cast(Any, problem.instrument).rings or 1):
-                    needed = with_rings(needed, rings)
+                instrument, is_open = cast(Any, problem.instrument), name in open_rays
+                if is_open and (rings := rings_of_lobes(problem, vector)) > instrument.rings:
+                    needed = replace(needed, instrument=replace(instrument, rings=rings))
+                errors.append(error_of_rays(problem, vector, predicted) if needed is problem else np.nan)
+                words.append(_error_in_words(_rings_in_words(problem), errors[-1], False, is_open))
             if needed is not problem:
                 changed[name] = needed
-            if parts:  # of one measurement errors add up
-                resolution, words = (", ".join(getattr(part, of) for part in parts) for of in ("resolution", "words"))
-                error = float(np.sum([part.error for part in parts]))
-                accuracies[name] = Accuracy(resolution, error, f"numerical error of the model: {words}")
+            if errors:  # of one measurement errors add up
+                resolution = resolution_in_words(problem, one)
+                said = f"numerical error of the model: {', '.join(words)}"
+                accuracies[name] = Accuracy(resolution, float(np.sum(errors)), said)
         if not changed:
-            resolution, words = (
+            resolution, said = (
                 _by_name({name: getattr(one, of) for name, one in accuracies.items()}) for of in ("resolution", "words")
             )
-            return at, Accuracy(resolution, float(np.max([one.error for one in accuracies.values()])), words)
+            return at, Accuracy(resolution, float(np.max([one.error for one in accuracies.values()])), said)
         whole = at.problem.with_problems(changed)
-        words = _by_name({name: resolution_in_words(whole.problems[name], known.get(name)) for name in accuracies})
-        ends = _fitted_again(at, whole, words, options.equivalent_cost, progress)
+        resolution = _by_name({name: resolution_in_words(whole.problems[name], known.get(name)) for name in accuracies})
+        ends = _fitted_again(at, whole, resolution, options.equivalent_cost, progress)
         again = polish(whole, ends, check=at.improved)
         at = again._replace(improved=again.improved or at.improved)
 
@@ -369,9 +301,21 @@ def transport_of(problem: Problem, known: Resolutions) -> lj.AddingDoubling:
 def resolution_in_words(problem: Problem, known: Resolutions | None) -> str:
     """The resolution of a problem whose transport may have one."""
     parts = [] if known is None else [known.in_words(transport_of(problem, known))]
-    if has_rays(problem):
-        parts.append(_rings_in_words(cast(Any, problem.instrument).rings or 1))
-    return ", ".join(parts)
+    return ", ".join(parts + ([_rings_in_words(problem)] if has_rays(problem) else []))
+
+
+def _rings_in_words(problem: Problem) -> str:
+    rings = cast(Any, problem.instrument).rings or 1
+    return f"{rings} ring{'s' if rings > 1 else ''} of rays a cone"
+
+
+def _error_in_words(resolution: str, error: float, finest: bool, is_open: bool) -> str:
+    """finest: the resolution is the finest tried, so that the error is that of a coarser one."""
+    if not np.isfinite(error):
+        return f"not known at {resolution}"
+    if finest:
+        return f"up to {error:.2g} sigma at {resolution}{', the finest tried' if is_open else ''}"
+    return f"{error:.2g} sigma at most at {resolution}{'' if is_open else ', as given'}"
 
 
 def _by_name(words: Mapping[str, str]) -> str:
@@ -383,38 +327,25 @@ def _fitted_again(
 ) -> list[StartOutcome]:
     """The ends at another resolution: those that matter fitted again, the cost of the others there."""
 
-    def cost(end: StartOutcome) -> float:
+    def with_cost(end: StartOutcome) -> StartOutcome:
         found = float(problem.call(Model.cost_at, end.vector, problem.predict(end.vector)))
-        return found if np.isfinite(found) else np.inf
+        return end._replace(cost=found if np.isfinite(found) else np.inf)
 
-    # 1. ends that lie close together count as one, lowest first
-    groups: list[list[int]] = []
-    units = [unit_of(at.problem, end.vector) for end in at.ends]
+    result, lowest = list(at.ends), with_cost(at.lowest)
+    shift = abs(lowest.cost - at.lowest.cost)  # by so much costs may move
+    units, fitted = [unit_of(at.problem, end.vector) for end in at.ends], list[int]()
     for index in sorted(range(len(at.ends)), key=lambda index: (index != at.best, at.ends[index].cost)):
-        if np.isfinite(at.ends[index].cost):
-            near = (group for group in groups if np.max(np.abs(units[index] - units[group[0]])) < SAME_OUTCOME)
-            if (group := next(near, None)) is None:
-                groups.append(group := [])
-            group.append(index)
-    # 2. those matter whose cost is no farther above the lowest than that may move
-    before = [at.ends[group[0]] for group in groups]
-    ends = [end._replace(cost=cost(end)) for end in before]
-    moved = np.abs([new.cost - old.cost for new, old in zip(ends, before, strict=True)])
-    above = np.array([end.cost - before[0].cost for end in before])
-    matter = np.flatnonzero(~(above > equivalent * at.excess + np.fmax(moved, moved[0])))
-    # 3. they are fitted again, and then what is lowest until it was
-    wanted, fitted, done = [int(index) for index in matter[:MOST_MINIMA]], set[int](), 0
-    while wanted:
-        for index in wanted:
-            end = rough_descent(problem, unit_of(problem, before[index].vector), False)
-            ends[index] = end._replace(steps=before[index].steps + end.steps)
-            fitted.add(index)
-            done += 1
-            progress(f"fit at {words}", done, len(fitted | set(wanted)), f"best cost {min(e.cost for e in ends):.6g}")
-        lowest = int(np.argmin([end.cost for end in ends]))
-        wanted = [] if lowest in fitted else [lowest]
-    result = list(at.ends)
-    for group, end in zip(groups, ends, strict=True):
-        for index in group:
-            result[index] = end
+        before = at.ends[index]
+        near = (other for other in fitted if np.max(np.abs(units[index] - units[other])) < SAME_OUTCOME)
+        if (other := next(near, None)) is not None:
+            result[index] = result[other]
+        elif np.isfinite(before.cost):
+            result[index] = with_cost(before)
+            above, moved = result[index].cost - lowest.cost, abs(result[index].cost - before.cost)
+            if len(fitted) < MOST_MINIMA and not above > equivalent * at.excess + np.fmax(moved, shift):
+                end = rough_descent(problem, units[index], fresh=False)
+                result[index] = end._replace(steps=before.steps + end.steps)
+                fitted.append(index)
+                best = min(end.cost for end in result)
+                progress(f"fit at {words}", len(fitted), None, f"best cost {best:.6g}")
     return result

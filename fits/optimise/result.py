@@ -124,17 +124,18 @@ class Fit:
         Raises:
             ValueError: a name that no measurement has.
         """
-        problem = self.problem.problems.get(name)
-        if problem is None:
-            raise ValueError(f"part {name!r} is not one of {', '.join(self.problem.problems)}")
+        own = list(self.problem.places(name))
+        problem = self.problem.problems[name]
         if problem is self.problem:
             return self
-        own = list(self.problem.places(name))
         called = {self.problem.names[place]: plain for place, plain in zip(own, problem.names, strict=True)}
 
-        def minimum(one: Minimum) -> Minimum:
-            values = {plain: one.values[whole] for whole, plain in called.items()}
-            return replace(one, values=values, stack=one.stack[name])
+        def names(some: tuple[str, ...]) -> tuple[str, ...]:
+            return tuple(called[name] for name in some if name in called)
+
+        def minima(some: tuple[Minimum, ...]) -> tuple[Minimum, ...]:
+            values = [{plain: one.values[whole] for whole, plain in called.items()} for one in some]
+            return tuple(replace(one, values=v, stack=one.stack[name]) for one, v in zip(some, values, strict=True))
 
         found = replace(
             self,
@@ -142,11 +143,11 @@ class Fit:
             vector=self.vector[own],
             errors=self.errors[own],
             covariance=self.covariance[np.ix_(own, own)],
-            at_bound=_called(self.at_bound, called),
-            insensitive=_called(self.insensitive, called),
+            at_bound=names(self.at_bound),
+            insensitive=names(self.insensitive),
             unidentified=tuple(one.renamed(called) for one in self.unidentified if set(one.weights) & set(called)),
-            minima=tuple(map(minimum, self.minima)),
-            alternatives=tuple(map(minimum, self.alternatives)),
+            minima=minima(self.minima),
+            alternatives=minima(self.alternatives),
             without_discrepancy=self.without_discrepancy_parts.get(name),
             dataset=name,
         )
@@ -154,21 +155,13 @@ class Fit:
         return found
 
     def require_one(self, what: str) -> None:
-        """Refuse, for `what` shows or keeps one measurement, a fit of several.
-
-        Raises:
-            ValueError: it is one.
-        """
+        """ValueError, for `what` shows or keeps one measurement, of a fit of several."""
         problems = self.problem.problems
         if problems.get("") is not self.problem:
             raise ValueError(f"{what}: of a joint fit it takes a part: fit.part(...) of {', '.join(problems)}")
 
     def require_alone(self, what: str) -> None:
-        """Refuse, for `what` asks the data anew, one measurement of several, whose problem knows nothing of the others.
-
-        Raises:
-            ValueError: it is one.
-        """
+        """ValueError, for `what` asks the data anew, of one measurement of several: its problem has no others."""
         if self.dataset is not None:
             raise ValueError(
                 f"{what}: {self.dataset!r} is a part of a joint fit, and without the others it says something "
@@ -249,8 +242,3 @@ class Fit:
         spread = np.sqrt(np.diagonal(self.covariance))
         spread = np.where(spread > 0, spread, np.nan)
         return self.covariance / np.outer(spread, spread)
-
-
-def _called(names: tuple[str, ...], called: Mapping[str, str]) -> tuple[str, ...]:
-    """Those of the names that are known, as they are called elsewhere."""
-    return tuple(called[name] for name in names if name in called)

@@ -100,22 +100,26 @@ def uncertainty(problem: FittingProblem, vector: Floats, cost: float) -> Uncerta
     if problem.objective != "likelihood":
         scatter = max(2.0 * cost / max(problem.count - count, 1), np.finfo(float).tiny)
     data_root, least_gradient = data_root / np.sqrt(scatter), LEAST_GRADIENT * scatter
-    idle = insensitive(data_root, problem.names)
-    at_bound = ((unit <= ON_BOUND) & (gradient > least_gradient)) | (
-        (unit >= 1 - ON_BOUND) & (gradient < -least_gradient)
-    )
-    at_bound &= ~np.isin(problem.names, idle)
+    # what the data say nothing about, whatever is known of the others: its column of A is all but 0
+    idle = np.linalg.norm(data_root, axis=0) * UNKNOWN_BEYOND < 1.0
+    pushes = (unit <= ON_BOUND) & (gradient > least_gradient), (unit >= 1 - ON_BOUND) & (gradient < -least_gradient)
+    at_bound = (pushes[0] | pushes[1]) & ~idle
     free = np.flatnonzero(~at_bound)
     width = np.asarray(box.slope(jnp.asarray(vector)), float)
     unidentified = unidentified_directions(data_root, problem.names, width)
-    data_root, prior_root = data_root[:, free], _prior_root(problem)[:, free]
+    insensitive = tuple(name for name, none in zip(problem.names, idle, strict=True) if none)
+    data_root, prior_root = data_root[:, free], np.asarray(box.prior_slopes(), float)[:, free]
     errors, covariance = np.full(count, np.nan), np.zeros((count, count))
     if free.size:
-        boxes = _inverse_information(np.vstack([data_root, prior_root]))
+        _, values, directions = np.linalg.svd(square(np.vstack([data_root, prior_root])))
+        scaled = directions / floored(values)[:, None]
+        boxes = scaled.T @ scaled  # (A'A)^-1
         spread = np.sqrt(np.diagonal(boxes))
         errors[free] = np.where(spread > UNKNOWN_BEYOND, np.inf, spread * width[free])
         covariance[np.ix_(free, free)] = boxes * np.outer(width[free], width[free])
-    return Uncertainty(at_bound, errors, covariance, condition_number(data_root), unidentified, idle, found.predicted)
+    return Uncertainty(
+        at_bound, errors, covariance, condition_number(data_root), unidentified, insensitive, found.predicted
+    )
 
 
 def local_information(problem: FittingProblem, unit: Floats) -> tuple[Floats, Floats, float]:
@@ -124,7 +128,11 @@ def local_information(problem: FittingProblem, unit: Floats) -> tuple[Floats, Fl
     And the gradient of the negative log-posterior there, (P,), in boxes^-1, and this itself up to a constant.
     """
     found = evaluate_at(problem, unit)
-    return np.vstack([found.root, _prior_root(problem)]), found.gradient, float(found.cost)
+    return (
+        np.vstack([found.root, np.asarray(problem.model.box.prior_slopes(), float)]),
+        found.gradient,
+        float(found.cost),
+    )
 
 
 def condition_number(root: Floats) -> float:
@@ -136,18 +144,6 @@ def condition_number(root: Floats) -> float:
         return float("inf")
     values = np.linalg.svd(square(root / lengths), compute_uv=False)
     return float(values[0] / values[-1]) if values[-1] > 0 else float("inf")
-
-
-def _prior_root(problem: FittingProblem) -> Floats:
-    """Rows (P + Q, P) of the prior's information, in boxes^-1."""
-    return np.asarray(problem.model.box.prior_slopes(), float)
-
-
-def _inverse_information(root: Floats) -> Floats:
-    """(A'A)^-1 by singular values."""
-    _, values, directions = np.linalg.svd(square(root))
-    scaled = directions / floored(values)[:, None]
-    return scaled.T @ scaled
 
 
 def unidentified_directions(root: Floats, names: tuple[str, ...], width: Floats) -> tuple[Direction, ...]:
@@ -186,12 +182,6 @@ def unidentified_directions(root: Floats, names: tuple[str, ...], width: Floats)
 def floored(values: Floats) -> Floats:
     """Singular values, those lost in rounding as the smallest that are not: their inverses are large, never wrong."""
     return np.maximum(values, np.maximum(np.finfo(float).eps * len(values) * values[0], 1.0 / LARGEST_ERROR))
-
-
-def insensitive(root: Floats, names: tuple[str, ...]) -> tuple[str, ...]:
-    """Parameters that the data say nothing about, whatever is known of the others: their columns of A are all but 0."""
-    lengths = np.linalg.norm(root, axis=0)
-    return tuple(name for name, length in zip(names, lengths, strict=True) if length * UNKNOWN_BEYOND < 1.0)
 
 
 def square(root: Floats) -> Floats:

@@ -68,26 +68,27 @@ class _Limit:
 @contextmanager
 def one_thread() -> Iterator[None]:
     """LAPACK by one thread: those of a small matrix wait for each other busily, a hundredfold beside other work."""
-    with _Limit.lock:
-        _Limit.calls += 1
-        if _Limit.calls == 1:
-            _let_any_thread_limit()
-            _Limit.limited = _libraries().limit(limits=1)
+    _count(1)
     try:
         yield
     finally:
-        with _Limit.lock:
-            _Limit.calls -= 1
-            if not _Limit.calls:
-                _let_any_thread_limit()
-                _Limit.limited.restore_original_limits()
-                _let_any_thread_limit()
+        _count(-1)
 
 
-def _let_any_thread_limit() -> None:
-    """threadpoolctl 3.7 and later ignores, without a word, all threads but the first that set a limit."""
-    if hasattr(OpenBLASController, "clear_controlling_thread"):
-        OpenBLASController.clear_controlling_thread(force=True)
+def _count(change: int) -> None:
+    with _Limit.lock:
+        before, _Limit.calls = _Limit.calls, _Limit.calls + change
+        if before and _Limit.calls:
+            return
+        if hasattr(OpenBLASController, "clear_controlling_thread"):
+            # threadpoolctl 3.7 and later ignores, without a word, all threads but the first that set a limit
+            OpenBLASController.clear_controlling_thread(force=True)
+        if _Limit.calls:
+            _Limit.limited = _libraries().limit(limits=1)
+        else:
+            _Limit.limited.restore_original_limits()
+            if hasattr(OpenBLASController, "clear_controlling_thread"):
+                OpenBLASController.clear_controlling_thread(force=True)
 
 
 @cache

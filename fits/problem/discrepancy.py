@@ -13,13 +13,6 @@ The negative log-density of all measurements is half a sum of squares again, up 
 c to errors in standard deviations of the noise, z the residuals, and B = 1 + A'A = C C',
 
     (z'(1 + A A')^-1 z + log det (1 + A A')) / 2 = min_c (|z - A c|^2 + |c|^2) / 2 + sum log diag C.
-
-Derivatives are in closed form. A parameter of the process moves the root of its covariance by dA = A X, where X + X' is
-the change of that covariance between white numbers; with c = B^-1 A'z,
-
-    dc = B^-1 (X + X') c - X c,    d(A c) = A B^-1 (X + X') c,    d log diag C = diag(C^-1 (B - 1) X C'^-1),
-
-and C^-1 (B - 1) = C' - C^-1. So a Jacobian by many parameters makes matrices for those few of the process alone.
 """
 
 from dataclasses import dataclass
@@ -35,8 +28,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from fits.data.geometry import Floats
 from fits.problem.parameters import Free, LogNormal, Normal, require_number_or_free
-
-Trio = tuple[Array, Array, Array]
 
 LONGEST = 40.0
 """Degrees of a length scale whose prior is not given, at most: what is correlated farther would take the place of the
@@ -110,7 +101,7 @@ class Discrepancy:
 
 
 def numbers_of(discrepancy: Discrepancy, shortest: Floats, channels: int) -> Correlation:
-    """The parameters of a process, with the default of each that is None; shortest: (2,), see `InducingPoints`."""
+    """The parameters of a process, with the default of each that is None; shortest: (2,), see `Process`."""
 
     def length(shortest: float) -> Free:
         low, high = min(shortest, LONGEST), max(LONGEST, 1.4 * shortest)
@@ -151,7 +142,7 @@ def size(x: Any, s: Any) -> Array:
     return jnp.hypot(x, s)
 
 
-# ---- places in half and difference angle, the kernel there, and inducing points ----
+# ---- places in half and difference angle, the kernel there, and which places are inducing points ----
 
 
 def places(wi: ArrayLike, wo: ArrayLike) -> Floats:
@@ -198,43 +189,6 @@ def log_scales(where: Any) -> Any:
     return -first - second
 
 
-class InducingPoints(NamedTuple):
-    """R places among those of N measurements.
-
-    where: (R, 4), see `places`. weights: (N, R), from inducing points to measurements. shortest: (2,), what errors
-    reach at least, in degrees of half vector and difference, so that inducing points carry them.
-    """
-
-    where: Floats
-    weights: Floats
-    shortest: Floats
-
-
-def inducing_points(wi: ArrayLike, wo: ArrayLike, channels: int = 1) -> InducingPoints:
-    """Of measurements along these directions, (N, 3) each: all of their places, where these are few.
-
-    Else those that a pivoted Cholesky decomposition takes first (Fine & Scheinberg 2001): of what errors vary by given
-    those at the inducing points before, the place where it is most. The other measurements are regressed on them.
-    """
-    where = places(wi, wo)
-    _, first = np.unique(np.round(where, 6), axis=0, return_index=True)
-    those = where[np.sort(first)]
-    those = those[:: -(-len(those) // CANDIDATES)]
-    most = min(SOME_NODES + len(where) // A_NODE, MOST_NODES)
-    most = max(FEWEST_NODES, min(most, MOST_ROWS // channels))
-    spans = np.array([np.ptp(where[:, 0]), max(np.ptp(where[:, 1]), np.ptp(where[:, 2]))])
-    shortest = np.clip(spans / REACHES, LEAST_SHORTEST, SHORTEST)
-    chosen, lost = _pivots(those, shortest, most)
-    while lost > LOST:
-        shortest = LONGER * shortest
-        chosen, lost = _pivots(those, shortest, most)
-    among = those[chosen]
-    typical = TYPICAL * shortest
-    own = correlation(among, among, *typical) + ROUNDING * np.eye(len(among))
-    weights = np.linalg.solve(own, correlation(among, where, *typical)).T
-    return InducingPoints(among, weights, shortest)
-
-
 def _pivots(where: Floats, reach: Floats, most: int) -> tuple[list[int], float]:
     """Indices of so many places (N, 4) at most, as they are chosen; and the most that they leave of the variance."""
     rows, left, chosen = np.zeros((most, len(where))), np.ones(len(where)), list[int]()
@@ -248,171 +202,6 @@ def _pivots(where: Floats, reach: Floats, most: int) -> tuple[list[int], float]:
         left[pivot] = 0.0
         chosen.append(pivot)
     return chosen, float(np.max(left))
-
-
-# ---- white numbers, and residuals less the discrepancy, with derivatives in closed form ----
-
-
-class Roots(NamedTuple):
-    """Roots of the covariance of channels, (C, C), and of inducing points, (R, R), but for the amplitude; that of all
-    is their product."""
-
-    channels: Array
-    inducing_points: Array
-
-
-class Move(NamedTuple):
-    """X of a number of the process: a factor between channels, (C, C), or between inducing points, (R, R); the other is
-    1."""
-
-    between_channels: bool
-    factor: Array
-
-
-def _vector_of(at: Correlation, channels: int) -> Array:
-    """Those of a process that matter, (4,) or (5,)."""
-    return jnp.stack([jnp.asarray(number, float) for number in (at if channels > 1 else at[:4])])
-
-
-def _with_jitter(matrix: Array) -> Array:
-    """A matrix of correlations with what rounding leaves of its smallest eigenvalues on its diagonal."""
-    rounding = 4.0 * len(matrix) * float(jnp.finfo(matrix.dtype).eps)  # above `JITTER` in single precision alone
-    return matrix + max(JITTER, rounding) * jnp.eye(len(matrix), dtype=matrix.dtype)
-
-
-def _roots_of(numbers: Array, where: Array, channels: int) -> Roots:
-    """The roots of a process on inducing points `where`, (R, 4)."""
-    _, half, difference, growth = numbers[:4]
-    own = _with_jitter(correlation(where, where, half, difference))
-    between = numbers[4] + (1.0 - numbers[4]) * jnp.eye(channels) if channels > 1 else jnp.ones((1, 1))
-    sizes = jnp.exp(growth * log_scales(where))
-    return Roots(jnp.linalg.cholesky(_with_jitter(between)), sizes[:, None] * jnp.linalg.cholesky(own))
-
-
-def _moves_of(numbers: Array, where: Array, roots: Roots) -> list[Move]:
-    """The moves of all numbers but the amplitude."""
-    inverse = _triangular_inverse(roots.inducing_points)
-    sizes = jnp.exp(numbers[3] * log_scales(where))
-    by_lengths = jax.jacfwd(lambda lengths: correlation(where, where, *lengths))(numbers[1:3])
-    scaled = inverse * sizes
-    found = [Move(False, _halved(scaled @ by_lengths[..., k] @ scaled.T)) for k in range(2)]
-    found.append(Move(False, inverse @ (log_scales(where)[:, None] * roots.inducing_points)))
-    if len(numbers) > 4:
-        inverse = _triangular_inverse(roots.channels)
-        found.append(Move(True, _halved(inverse @ (1.0 - jnp.eye(len(inverse))) @ inverse.T)))
-    return found
-
-
-def _moved(rows: Array, move: Move, roots: Roots) -> Array:
-    """Rows (M, C R) of white numbers times X."""
-    split = rows.reshape(-1, len(roots.channels), len(roots.inducing_points))
-    by = "mcr,cx->mxr" if move.between_channels else "mcr,rx->mcx"
-    return jnp.einsum(by, split, move.factor).reshape(rows.shape)
-
-
-def _on_points(roots: Roots, white: Array) -> Array:
-    """Errors (C, R), at an amplitude of 1, from white numbers (C R,)."""
-    return roots.channels @ white.reshape(len(roots.channels), -1) @ roots.inducing_points.T
-
-
-def _from_points(roots: Roots, observed: Array) -> Array:
-    """The transpose of `on_points`: (C R,) from (C, R)."""
-    return (roots.channels.T @ observed @ roots.inducing_points).reshape(-1)
-
-
-def _gram(weights: Array, relative: Array) -> Array:
-    """What measurements say of inducing points, (C, R, R), by weights (N, R); relative: an error of 1 in units of
-    noise, (N, C)."""
-    return jnp.stack([weights.T @ (column[:, None] ** 2 * weights) for column in relative.T])
-
-
-def _roots_and_square(
-    numbers: Array, where: Array, weights: Array, gram: Array | None, relative: Array
-) -> tuple[Roots, Array]:
-    """The roots of a process, and A'A at an amplitude of 1, (C R, C R)."""
-    roots = _roots_of(numbers, where, relative.shape[-1])
-    gram = _gram(weights, relative) if gram is None else gram
-    square = jnp.einsum("ri,crs,sj->cij", roots.inducing_points, gram, roots.inducing_points)
-    if len(square) == 1:
-        return roots, roots.channels[0, 0] ** 2 * square[0]
-    size = square.shape[0] * square.shape[1]
-    return roots, jnp.einsum("cx,cy,cij->xiyj", roots.channels, roots.channels, square).reshape(size, size)
-
-
-def _root_of(amplitude: Array, square: Array) -> Array:
-    """C, from A'A at an amplitude of 1."""
-    return jnp.linalg.cholesky(amplitude**2 * square + jnp.eye(len(square)))
-
-
-def _triangular_inverse(root: Array) -> Array:
-    """The inverse of a lower triangular matrix."""
-    return solve_triangular(root, jnp.eye(len(root), dtype=root.dtype), lower=True)
-
-
-@jax.custom_jvp
-def _whitened(numbers: Array, where: Array, weights: Array, gram: Array | None, z: Array, relative: Array) -> Trio:
-    """z - A c (N, C), c (C R,) and log diag C (C R,), of residuals z (N, C) in units of the noise.
-
-    Inducing points, weights (N, R) and a `gram` (C, R, R) that is given do not depend on parameters, nor does
-    `relative` (N, C) with it.
-    """
-    roots, square = _roots_and_square(numbers, where, weights, gram, relative)
-    root, amplitude = _root_of(numbers[0], square), numbers[0]
-    half = solve_triangular(root, amplitude * _from_points(roots, (weights.T @ (relative * z)).T), lower=True)
-    white = solve_triangular(root, half, lower=True, trans=1)
-    errors = relative * (weights @ (amplitude * _on_points(roots, white)).T)
-    return z - errors, white, jnp.log(jnp.diagonal(root))
-
-
-@_whitened.defjvp
-def _(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[Trio, Trio]:
-    numbers, where, weights, gram, z, relative = primals
-    by_numbers, _, _, _, by_z, by_relative = tangents
-    amplitude, (roots, square) = numbers[0], _roots_and_square(numbers, where, weights, gram, relative)
-    root = _root_of(amplitude, square)
-    inverse = _triangular_inverse(root)
-
-    def back(x: Array) -> Array:
-        """Towards white numbers, (C R,), from measurements, (N, C)."""
-        return _from_points(roots, (weights.T @ x).T)
-
-    def solved(x: Array) -> Array:
-        return inverse.T @ (inverse @ x)
-
-    wanted = back(relative * z)
-    white = amplitude * solved(wanted)
-    discrepancy = weights @ (amplitude * _on_points(roots, white)).T
-    left = z - relative * discrepancy
-
-    steps = _moves_of(numbers, where, roots)
-    pulled = [_moved(white[None], step._replace(factor=step.factor.T), roots)[0] for step in steps]
-    pushed = [_moved(white[None], step, roots)[0] for step in steps]
-    sums = [solved(one + other) for one, other in zip(pulled, pushed, strict=True)]
-    by_amplitude = solved(wanted - 2.0 * amplitude * (square @ white))
-    whites = [by_amplitude] + [total - one for total, one in zip(sums, pulled, strict=True)]
-    errors = [white + amplitude * by_amplitude] + [amplitude * total for total in sums]
-
-    safe = jnp.where(amplitude > 0.0, amplitude, 1.0)
-    levels = [jnp.where(amplitude > 0.0, (1.0 - jnp.sum(inverse**2, axis=-1)) / safe, 0.0)]
-    levels += [jnp.sum(_moved(root.T - inverse, step, roots) * inverse, axis=-1) for step in steps]
-
-    by_levels, observed, by_discrepancy = by_numbers @ jnp.stack(levels), relative * by_z, 0.0
-    if gram is None:
-        by_discrepancy = by_relative * discrepancy
-        observed = observed + by_relative * left - relative * by_discrepancy
-        parts = inverse.reshape(len(root), *map(len, roots)), roots.channels, weights @ roots.inducing_points
-        seen = amplitude * jnp.einsum("mcr,dc,nr->mnd", *parts)
-        by_levels = by_levels + jnp.tensordot(seen**2, relative * by_relative, 2)
-    own = amplitude * solved(back(observed))
-    moved_nodes = _on_points(roots, by_numbers @ jnp.stack(errors) + amplitude * own)
-    by_left = by_z - by_discrepancy - relative * (weights @ moved_nodes.T)
-    found = left, white, jnp.log(jnp.diagonal(root))
-    return found, (by_left, by_numbers @ jnp.stack(whites) + own, by_levels)
-
-
-def _halved(matrix: Array) -> Array:
-    """The lower triangle whose sum with its transpose is a symmetric matrix."""
-    return jnp.tril(matrix) - 0.5 * jnp.diag(jnp.diagonal(matrix))
 
 
 # ---- the process ----
@@ -430,9 +219,49 @@ class Whitened(NamedTuple):
     levels: Array
 
 
+class Factors(NamedTuple):
+    """Roots of the covariance of channels, (C, C), and of inducing points, (R, R), but for the amplitude; A'A, and the
+    root C of B = 1 + A'A, (C R, C R)."""
+
+    amplitude: Array
+    channels: Array
+    points: Array
+    square: Array
+    root: Array
+
+
+class Moves(NamedTuple):
+    """X of each number of a process, by which A moves by dA = A X; X + X' is the change of the covariance between white
+    numbers. Of the amplitude it is a number, of the others (K, C, C) between channels plus (K, R, R) between points."""
+
+    amplitude: Array
+    channels: Array
+    points: Array
+
+    @property
+    def transposed(self) -> "Moves":
+        """X'."""
+        return Moves(self.amplitude, self.channels.swapaxes(1, 2), self.points.swapaxes(1, 2))
+
+    def times(self, rows: Array) -> Array:
+        """Rows (M, C R) of white numbers times X, (1 + K, M, C R)."""
+        split = rows.reshape(len(rows), self.channels.shape[-1], -1)
+        others = jnp.einsum("mcr,kcx->kmxr", split, self.channels) + jnp.einsum("mcr,krx->kmcx", split, self.points)
+        return jnp.concatenate([self.amplitude * rows[None], others.reshape(-1, *rows.shape)])
+
+
 class Process(eqx.Module):
-    """A process on R `InducingPoints`. gram: `gram_of` measurements, (C, R, R), where their noise is known; else
-    None."""
+    """A process on R inducing points among the places of N measurements.
+
+    Residuals z of measurements, and `relative`, an error of 1 in the logarithm, are (N, C) and in units of the noise.
+
+    Attributes:
+        where: the inducing points, (R, 4), see `places`.
+        weights: (N, R), from inducing points to measurements.
+        shortest: (2,), what errors reach at least, in degrees of half vector and difference, so that inducing points
+            carry them.
+        gram: `gram_of` measurements, (C, R, R), where their noise is known; else None.
+    """
 
     where: Array
     weights: Array
@@ -440,19 +269,17 @@ class Process(eqx.Module):
     gram: Array | None = None
 
     def gram_of(self, relative: Array) -> Array:
-        """What measurements say of inducing points, (C, R, R); relative: an error of 1 in units of the noise, (N,
-        C)."""
-        return _gram(self.weights, relative)
+        """What measurements say of inducing points, (C, R, R)."""
+        return jnp.stack([self.weights.T @ (column[:, None] ** 2 * self.weights) for column in relative.T])
 
     def whitened(self, z: Array, relative: Array, at: Correlation) -> Whitened:
-        """What is left of residuals z (N, C) in units of the noise; relative: as for `gram_of`."""
-        numbers = _vector_of(at, z.shape[-1])
-        return Whitened(*_whitened(numbers, self.where, self.weights, self.gram, z, relative))
+        """What is left of residuals when the discrepancy that they imply is taken away."""
+        return Whitened(*_whitened(self._numbers(at, z.shape[-1]), z, relative, process=self))
 
     def sample(self, white: Array, at: Correlation) -> Array:
         """Errors of the measurements, (N, C), from standard normal numbers (C, R)."""
-        roots = _roots_of(_vector_of(at, len(white)), self.where, len(white))
-        return at.amplitude * self.weights @ _on_points(roots, white.reshape(-1)).T
+        between, own = map(jnp.linalg.cholesky, self._covariances(self._numbers(at, len(white)), len(white)))
+        return at.amplitude * self.weights @ (between @ white @ own.T).T
 
     def whitened_residuals(self, z: Array, relative: Array, at: Correlation) -> Array:
         """Residuals z (N, C) by the symmetric root of their covariance, K^-1/2 z with K = 1 + A A'.
@@ -462,35 +289,34 @@ class Process(eqx.Module):
         smaller than 1, and negatively correlated between neighbours. Leave-one-out residuals (`leave_one_out`) have
         variance 1, but are correlated, too.
         """
-        roots, square = self._roots_and_square(relative, at)
-        spread, axes = jnp.linalg.eigh(at.amplitude**2 * square)  # of A'A
+        factors = self.factors(self._numbers(at, relative.shape[-1]), relative)
+        spread, axes = jnp.linalg.eigh(factors.square)
         root = jnp.sqrt(1.0 + jnp.maximum(spread, 0.0))
-        explained = at.amplitude * _from_points(roots, (self.weights.T @ (relative * z)).T)
-        white = -(axes @ ((axes.T @ explained) / (root * (1.0 + root))))  # ((1 + s)^-1/2 - 1) / s
-        return z + relative * (self.weights @ (at.amplitude * _on_points(roots, white)).T)
+        explained = axes.T @ self.to_white(relative * z, factors)
+        white = -(axes @ (explained / (root * (1.0 + root))))  # ((1 + s)^-1/2 - 1) / s
+        return z + relative * self.from_white(white, factors)
 
     def leave_one_out(self, whitened_data: Whitened, relative: Array, at: Correlation) -> tuple[Array, Array]:
         """Of each measurement its weighted residual and precision, (N, C): given all others it has mean residual /
         precision and variance 1 / precision, in units of the noise.
         """
-        roots, root = self._factors(relative, at)
-        rows = at.amplitude * jnp.einsum(
-            "nc,cx,nr->ncxr", relative, roots.channels, self.weights @ roots.inducing_points
-        )
-        solved = solve_triangular(root, rows.reshape(relative.size, -1).T, lower=True)
+        factors = self.factors(self._numbers(at, relative.shape[-1]), relative)
+        parts = relative, factors.channels, self.weights @ factors.points
+        rows = at.amplitude * jnp.einsum("nc,cx,nr->ncxr", *parts)
+        solved = solve_triangular(factors.root, rows.reshape(relative.size, -1).T, lower=True)
         return whitened_data.residuals, 1.0 - jnp.sum(solved**2, axis=0).reshape(relative.shape)
 
     def predict(
         self, whitened_data: Whitened, relative: Array, at_places: Array, at: Correlation
     ) -> tuple[Array, Array]:
         """Errors of the model at other `places`, given residuals that were whitened: mean and sd, (M, C)."""
-        roots, root = self._factors(relative, at)
+        factors = self.factors(self._numbers(at, relative.shape[-1]), relative)
         sizes, own = (jnp.exp(at.grazing_exponent * log_scales(where)) for where in (self.where, at_places))
         across = sizes[:, None] * own * correlation(self.where, at_places, at.length_half, at.length_difference)
-        across = solve_triangular(roots.inducing_points, across, lower=True)
-        rows = at.amplitude * jnp.einsum("cx,rm->mcxr", roots.channels, across)
+        across = solve_triangular(factors.points, across, lower=True)
+        rows = at.amplitude * jnp.einsum("cx,rm->mcxr", factors.channels, across)
         rows = rows.reshape(*rows.shape[:2], -1)
-        solved = solve_triangular(root, rows.reshape(-1, rows.shape[-1]).T, lower=True)
+        solved = solve_triangular(factors.root, rows.reshape(-1, rows.shape[-1]).T, lower=True)
         explained = jnp.sum(rows**2, axis=-1) - jnp.sum(solved**2, axis=0).reshape(rows.shape[:2])
         size = at.amplitude * own
         return -rows @ whitened_data.latent, jnp.sqrt(jnp.maximum(size[:, None] ** 2 - explained, 0.0))
@@ -498,31 +324,137 @@ class Process(eqx.Module):
     def information_rows(self, relative: Array, at: Correlation) -> Array:
         """Rows whose Jacobian A has in A'A the Fisher information of the measurements about the numbers of the process.
 
-        With M = 1 - B^-1 and E = X + X' (see `whitening`), it is tr(M E M E) / 2.
+        With M = 1 - B^-1 and E = X + X' (see `Moves`), it is tr(M E M E) / 2.
         """
-        numbers = _vector_of(at, relative.shape[-1])
+        numbers = self._numbers(at, relative.shape[-1])
         held = jax.lax.stop_gradient(numbers)
-        roots, root = self._factors(relative, Correlation(*held, *[0.0] * (5 - len(held))))
-        inverse = _triangular_inverse(root)
-        seen = jnp.eye(len(root)) - inverse.T @ inverse
-        parts = [2.0 / jnp.where(held[0] > 0.0, held[0], 1.0) * seen]
-        for step in _moves_of(held, self.where, roots):
-            parts.append(_moved(seen, step._replace(factor=step.factor + step.factor.T), roots))
-        flat = jnp.stack(parts)
+        factors = self.factors(held, relative)
+        inverse = _triangular_inverse(factors.root)
+        moves = self.moves(held, factors)
+        sums = Moves(*(one + other for one, other in zip(moves, moves.transposed, strict=True)))
+        flat = sums.times(jnp.eye(len(inverse)) - inverse.T @ inverse)
         information = 0.5 * jnp.einsum("kij,lji->kl", flat, flat)
         scale = 1.0 / jnp.sqrt(jnp.maximum(jnp.diagonal(information), LEAST_INFORMATION))
         scaled = information * scale[:, None] * scale + LEAST_INFORMATION * jnp.eye(len(scale))
         return jax.lax.stop_gradient(jnp.linalg.cholesky(scaled).T / scale) @ numbers
 
-    def _factors(self, relative: Array, at: Correlation) -> tuple[Roots, Array]:
-        """Roots of the covariances, and of B."""
-        roots, square = self._roots_and_square(relative, at)
-        return roots, _root_of(jnp.asarray(at.amplitude, float), square)
+    def _numbers(self, at: Correlation, channels: int) -> Array:
+        """Those of a process that matter, (4,) or (5,)."""
+        return jnp.stack([jnp.asarray(number, float) for number in (at if channels > 1 else at[:4])])
 
-    def _roots_and_square(self, relative: Array, at: Correlation) -> tuple[Roots, Array]:
-        return _roots_and_square(_vector_of(at, relative.shape[-1]), self.where, self.weights, self.gram, relative)
+    def _covariances(self, numbers: Array, channels: int) -> tuple[Array, Array]:
+        """Of channels, (C, C), and of inducing points, (R, R), but for the amplitude."""
+        together = numbers[4] if channels > 1 else jnp.zeros(())
+        sizes = jnp.exp(numbers[3] * log_scales(self.where))
+        own = _with_jitter(correlation(self.where, self.where, numbers[1], numbers[2]))
+        return _with_jitter(together + (1.0 - together) * jnp.eye(channels)), sizes[:, None] * own * sizes
+
+    def factors(self, numbers: Array, relative: Array) -> Factors:
+        """The matrices of a process with these numbers."""
+        between, own = map(jnp.linalg.cholesky, self._covariances(numbers, relative.shape[-1]))
+        gram = self.gram_of(relative) if self.gram is None else self.gram
+        square = jnp.einsum("ri,crs,sj->cij", own, gram, own)
+        square = jnp.einsum("cx,cy,cij->xiyj", between, between, square).reshape(2 * (len(between) * len(own),))
+        square = numbers[0] ** 2 * square
+        return Factors(numbers[0], between, own, square, jnp.linalg.cholesky(square + jnp.eye(len(square))))
+
+    def from_white(self, white: Array, factors: Factors) -> Array:
+        """Errors of the measurements, (N, C), from white numbers, (C R,)."""
+        errors = factors.channels @ white.reshape(len(factors.channels), -1) @ factors.points.T
+        return self.weights @ (factors.amplitude * errors).T
+
+    def to_white(self, observed: Array, factors: Factors) -> Array:
+        """The transpose of `from_white`."""
+        return factors.amplitude * (factors.channels.T @ (observed.T @ self.weights) @ factors.points).reshape(-1)
+
+    def moves(self, numbers: Array, factors: Factors) -> Moves:
+        """By which the root of the covariance moves with each number."""
+        changes = jax.jacfwd(lambda numbers: self._covariances(numbers, len(factors.channels)))(numbers)
+        halves = []
+        for root, change in zip((factors.channels, factors.points), changes, strict=True):
+            inverse = _triangular_inverse(root)
+            whole = inverse @ jnp.moveaxis(change[..., 1:], -1, 0) @ inverse.T
+            halves.append(jnp.tril(whole) - 0.5 * whole * jnp.eye(len(root)))
+        return Moves(1.0 / jnp.where(numbers[0] > 0.0, numbers[0], 1.0), *halves)
+
+
+@eqx.filter_custom_jvp
+def _whitened(numbers: Array, z: Array, relative: Array, *, process: Process) -> tuple[Array, Array, Array]:
+    """z - A c (N, C), c (C R,) and log diag C (C R,). Where the noise is known `relative` depends on no parameter."""
+    factors = process.factors(numbers, relative)
+    half = solve_triangular(factors.root, process.to_white(relative * z, factors), lower=True)
+    white = solve_triangular(factors.root, half, lower=True, trans=1)
+    return z - relative * process.from_white(white, factors), white, jnp.log(jnp.diagonal(factors.root))
+
+
+@_whitened.def_jvp
+def _(primals: tuple[Any, ...], tangents: tuple[Any, ...], *, process: Process) -> tuple[Any, Any]:
+    """In closed form: with X as in `Moves` and c = B^-1 A'z,
+
+        dc = B^-1 (X + X') c - X c,    d(A c) = A B^-1 (X + X') c,    d log diag C = diag(C^-1 (B - 1) X C'^-1).
+
+    So a Jacobian by many parameters makes matrices for the few numbers of the process alone: it is twice as fast.
+    """
+    numbers, z, relative = primals
+    by_numbers, by_z, by_relative = (
+        jnp.zeros_like(one) if tangent is None else tangent for one, tangent in zip(primals, tangents, strict=True)
+    )
+    factors = process.factors(numbers, relative)
+    inverse, moves = _triangular_inverse(factors.root), process.moves(numbers, factors)
+
+    def solved(x: Array) -> Array:
+        return inverse.T @ (inverse @ x)
+
+    white = solved(process.to_white(relative * z, factors))
+    discrepancy = process.from_white(white, factors)
+    left = z - relative * discrepancy
+    moved, pulled = (one.times(white[None])[:, 0] for one in (moves.transposed, moves))
+    sums = solved((moved + pulled).T).T
+    levels = jnp.sum(moves.times(factors.root.T - inverse) * inverse, axis=-1)  # C^-1 (B - 1) = C' - C^-1
+
+    by_levels, observed, by_discrepancy = by_numbers @ levels, relative * by_z, jnp.zeros_like(z)
+    if process.gram is None:
+        by_discrepancy = by_relative * discrepancy
+        observed = observed + by_relative * left - relative * by_discrepancy
+        parts = inverse.reshape(len(inverse), len(factors.channels), -1), factors.channels
+        seen = factors.amplitude * jnp.einsum("mcr,dc,nr->mnd", *parts, process.weights @ factors.points)
+        by_levels = by_levels + jnp.tensordot(seen**2, relative * by_relative, 2)
+    own = solved(process.to_white(observed, factors))
+    by_left = by_z - by_discrepancy - relative * process.from_white(by_numbers @ sums + own, factors)
+    found = left, white, jnp.log(jnp.diagonal(factors.root))
+    return found, (by_left, by_numbers @ (sums - moved) + own, by_levels)
+
+
+def _triangular_inverse(root: Array) -> Array:
+    return solve_triangular(root, jnp.eye(len(root), dtype=root.dtype), lower=True)
+
+
+def _with_jitter(matrix: Array) -> Array:
+    """A matrix of correlations with what rounding leaves of its smallest eigenvalues on its diagonal."""
+    rounding = 4.0 * len(matrix) * float(jnp.finfo(matrix.dtype).eps)  # above `JITTER` in single precision alone
+    return matrix + max(JITTER, rounding) * jnp.eye(len(matrix), dtype=matrix.dtype)
 
 
 def make_process(wi: ArrayLike, wo: ArrayLike, channels: int = 1) -> Process:
-    """The process of measurements along these directions, (N, 3) each, in so many channels."""
-    return Process(*map(jnp.asarray, inducing_points(wi, wo, channels)))
+    """The process of measurements along these directions, (N, 3) each: on all of their places, where these are few.
+
+    Else on those that a pivoted Cholesky decomposition takes first (Fine & Scheinberg 2001): of what errors vary by
+    given those at the inducing points before, the place where it is most. The other measurements are regressed on them.
+    """
+    where = places(wi, wo)
+    _, first = np.unique(np.round(where, 6), axis=0, return_index=True)
+    those = where[np.sort(first)]
+    those = those[:: -(-len(those) // CANDIDATES)]
+    most = min(SOME_NODES + len(where) // A_NODE, MOST_NODES)
+    most = max(FEWEST_NODES, min(most, MOST_ROWS // channels))
+    spans = np.array([np.ptp(where[:, 0]), max(np.ptp(where[:, 1]), np.ptp(where[:, 2]))])
+    shortest = np.clip(spans / REACHES, LEAST_SHORTEST, SHORTEST)
+    chosen, lost = _pivots(those, shortest, most)
+    while lost > LOST:
+        shortest = LONGER * shortest
+        chosen, lost = _pivots(those, shortest, most)
+    among = those[chosen]
+    typical = TYPICAL * shortest
+    own = correlation(among, among, *typical) + ROUNDING * np.eye(len(among))
+    weights = np.linalg.solve(own, correlation(among, where, *typical)).T
+    return Process(*map(jnp.asarray, (among, weights, shortest)))

@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 
 from fits.data.geometry import AT_NORMAL, LIGHT_AZIMUTH, Floats, polar
 from fits.data.scans import SAME_ANGLE
-from fits.problem.apertures import MOST_RINGS, Spread, ray_counts, rays, spread_over_lobes
+from fits.problem.apertures import MOST_OF_TWO, MOST_RINGS, rays, ring_counts
+from fits.problem.noise import require_floor
 from fits.problem.parameters import Free, LogNormal, require_number_or_free
 from layerjax._checks import require_count, require_number
 from layerjax.transport.known_directions import KnownDirections, known_directions
@@ -40,10 +41,10 @@ class Instrument:
     gain_sd: relative standard deviation, in [1e-4, 1], of a factor of its own that every polar angle of the
     light has, at all azimuths, beside the common scale, with a log-normal prior about 1 that they share; None: none.
     floor: of the noise, in 1/sr: as `Noise.floor`, in whose place it stands.
-    rings: of rays that stand for a cone where a lobe is narrowest, in [1, 8]; n of them keep the error below a
+    rings: of rays that stand for a cone where a lobe is narrowest, at most, in [1, 8]; n of them keep the error below a
     thousandth of the peak where the cones together are as wide as 0.64 n - 0.25 lobes at half maximum (two cones: a
-    sixth less). None: as many as the narrowest lobe asks for that the bounds of the stack allow; for a fit, as many as
-    the lobe asks for that it finds.
+    sixth less, and at most 4). None: as many as the narrowest lobe asks for that the bounds of the stack allow; for a
+    fit, as many as the lobe asks for that it finds.
     """
 
     source_aperture: float = 0.0
@@ -60,6 +61,7 @@ class Instrument:
             require_number_or_free("Instrument.tilt", self.tilt, -MOST_TILT, MOST_TILT)
         if self.gain_sd is not None:
             require_number("Instrument.gain_sd", self.gain_sd, *GAIN_SPREADS)
+        require_floor("Instrument.floor", self.floor)
         if self.rings is not None:
             require_count("Instrument.rings", self.rings, 1, MOST_RINGS)
 
@@ -113,18 +115,12 @@ def setting_of(instrument: Instrument, incidences: Floats) -> Setting:
 
 
 def optics_of(
-    instrument: Instrument,
-    stack: Any,
-    wi: Floats,
-    wo: Floats,
-    incidences: Floats,
-    follow: bool,
-    other: bool = False,
+    instrument: Instrument, stack: Any, wi: Floats, wo: Floats, incidences: Floats, follow: bool, other: bool = False
 ) -> Optics:
     """What stands for measurements along these directions, (N, 3) each, of a stack, `Free` or not.
 
     incidences: polar angles of the light, (K,), that have a gain. follow: known directions are of use. other: with
-    other numbers of rays, see `ray_counts`.
+    a ring more for each cone, or one less where there is none: the difference tells the error.
     """
     incidence = None if instrument.gain_sd is None else _which(wi, incidences)
     tilt = instrument.tilt
@@ -134,12 +130,14 @@ def optics_of(
     most = float(np.max(np.abs(tilt.arrays()[1:]))) if isinstance(tilt, Free) else 0.0
     pairs, row, share = (wi, wo), None, None
     widths = instrument.source_aperture, instrument.detector_aperture
-    if any(widths):
-        spread = spread_over_lobes(*widths, stack, wi, wo, most, instrument.rings)
-        if spread.matters.any():
-            pairs, row, share = _cones(instrument, wi, wo, spread, other)
-            if forward is not None:
-                forward = forward[row]  # the sample is tilted one way, whichever ray of a cone it meets
+    counts = ring_counts(*widths, stack, wi, wo, most, instrument.rings) if any(widths) else np.zeros(len(wi), int)
+    if counts.any():
+        if other:
+            finest = MOST_OF_TWO if all(widths) else MOST_RINGS
+            counts = np.where(counts == finest, finest - 1, counts + (counts > 0))
+        pairs, row, share = _cones(widths, wi, wo, counts)
+        if forward is not None:
+            forward = forward[row]  # the sample is tilted one way, whichever ray of a cone it meets
 
     def array(part: Any) -> Array | None:
         return None if part is None else jnp.asarray(part)
@@ -158,10 +156,8 @@ def optics_of(
 def rings_for(instrument: Instrument, setting: Setting, stack: Any, wi: Floats, wo: Floats) -> int:
     """Rings of rays of a cone that the lobes of a stack ask for, none of it `Free`, along directions (N, 3) each."""
     tilt = 0.0 if setting.tilt is None else abs(float(setting.tilt))
-    spread = spread_over_lobes(instrument.source_aperture, instrument.detector_aperture, stack, wi, wo, tilt)
-    if not spread.matters.any():
-        return 1
-    return int(np.max(ray_counts(spread.source[spread.matters], spread.detector[spread.matters])[:, :2]))
+    counts = ring_counts(instrument.source_aperture, instrument.detector_aperture, stack, wi, wo, tilt)
+    return max(int(np.max(counts)), 1)
 
 
 def gain_unknown(instrument: Instrument | None, wi: Floats, incidences: Floats) -> Floats:
@@ -178,26 +174,19 @@ def _which(wi: Floats, incidences: Floats) -> NDArray[np.int64]:
 
 
 def _cones(
-    instrument: Instrument, wi: Floats, wo: Floats, spread: Spread, other: bool
+    widths: tuple[float, float], wi: Floats, wo: Floats, counts: NDArray[np.int64]
 ) -> tuple[tuple[Floats, Floats], NDArray[np.int64], Floats]:
-    """Pairs (K, 3) each, the rows they belong to, (K,), and their shares, (K,)."""
-    wide = np.flatnonzero(~spread.matters)
-    narrow = np.flatnonzero(spread.matters)
-    lights, views, row, share = [wi[wide]], [wo[wide]], [wide], [np.ones(len(wide))]
-    counts = ray_counts(spread.source[narrow], spread.detector[narrow], other)
-    for kind in np.unique(counts, axis=0):
-        rows = narrow[np.all(counts == kind, axis=1)]
-        discs = rays(tuple(kind.tolist()))
-        parts, cosines = [], []
-        for w, width, disc in (
-            (wi[rows], instrument.source_aperture, discs.source),
-            (wo[rows], instrument.detector_aperture, discs.detector),
-        ):
-            rays_of_cone = _over_disc(w, math.radians(0.5 * width), disc)
+    """Pairs (K, 3) each, the rows that they belong to and their shares, (K,), by so many rings a measurement, (N,)."""
+    alone = np.flatnonzero(counts == 0)
+    lights, views, row, share = [wi[alone]], [wo[alone]], [alone], [np.ones(len(alone))]
+    for rings in np.unique(counts[counts > 0]):
+        rows = np.flatnonzero(counts == rings)
+        discs = rays(int(rings), *(width > 0.0 for width in widths))
+        weights, parts = discs.weights[:, None], []
+        for w, width, disc in zip((wi[rows], wo[rows]), widths, discs[:2], strict=True):
+            parts.append(_over_disc(w, math.radians(0.5 * width), disc))
             # light that would come or go below the horizon is not there
-            cosines.append(np.maximum(rays_of_cone[..., 2] * np.sign(w[:, 2]), 0.0) / np.abs(w[:, 2]))
-            parts.append(rays_of_cone)
-        weights = discs.weights[:, None] * cosines[0] * cosines[1]
+            weights = weights * np.maximum(parts[-1][..., 2] * np.sign(w[:, 2]), 0.0) / np.abs(w[:, 2])
         for found, part, w in ((lights, parts[0], wi[rows]), (views, parts[1], wo[rows])):
             found.append(np.where(weights[..., None] > 0.0, part, w).reshape(-1, 3))
         row.append(np.tile(rows, len(weights)))

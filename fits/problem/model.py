@@ -45,6 +45,10 @@ them, `functools.partial`, equinox modules and most objects with `__call__` are.
 
 Side = Literal["all", "reflection"]
 
+Step = tuple[Array, Array] | None
+"""Of the first step towards a fit of levels of noise: a scale of it, (N, C), that stands in the place of sigma where it
+is finite, and the share of the model discrepancy that counts; None: all is free."""
+
 
 class Parts(NamedTuple):
     """What a vector of parameters stands for: the stack, the common scale, and the levels of the noise model.
@@ -157,64 +161,53 @@ class Model(eqx.Module):
         return total_sigma(predicted, self.variance, parts.relative, parts.floor)
 
     def standardised_at(self, vector: Array, predicted: Array) -> Array:
-        """(datum - model) / sigma, (N, C); for a named objective: datum minus model in its own measure."""
+        """(datum - model) / sigma, (N, C): with model discrepancy of the `logarithm`, in units of the datum's noise.
+
+        For a named objective: datum minus model in its own measure.
+        """
         if self.objective != "likelihood":
             return -self._named(predicted)
-        return (self.values - predicted) / self.sigma_at(vector, predicted)
-
-    def offsets_at(self, vector: Array, predicted: Array) -> Array:
-        """`standardised_at`; with model discrepancy, of the `logarithm` in units of the datum's noise."""
-        if self.process is None:
-            return self.standardised_at(vector, predicted)
-        return -self._logarithmic(predicted, self._noise_at(vector, predicted))[0]
+        sigma = self._noise_at(vector, predicted)
+        return (self.values - predicted) / sigma if self.process is None else -self._scaled(sigma, predicted)
 
     def offsets_after_discrepancy_at(self, vector: Array, predicted: Array) -> Array:
-        """`offsets_at`, less the model discrepancy that the data imply."""
+        """`standardised_at`, less the model discrepancy that the data imply."""
         if self.process is None:
             return self.standardised_at(vector, predicted)
-        return -self.whitened_at(vector, predicted, self._noise_at(vector, predicted)).residuals
+        return -self.whitened_at(vector, predicted).residuals
 
     def whitened_residuals_at(self, vector: Array, predicted: Array) -> Array:
-        """`offsets_at` by the root of their covariance: under the assumed model independent, with variance 1."""
+        """`standardised_at` by the root of their covariance: under the assumed model independent, with variance 1."""
+        found = self.standardised_at(vector, predicted)
         if self.process is None:
-            return self.standardised_at(vector, predicted)
-        scaled = self._logarithmic(predicted, self._noise_at(vector, predicted))
-        return -self.process.whitened_residuals(*scaled, self._correlation(vector))
+            return found
+        relative = self._relative_at(self._noise_at(vector, predicted))
+        return self.process.whitened_residuals(found, relative, self._correlation(vector))
 
     def chi_square_at(self, vector: Array, predicted: Array) -> Array:
-        """z'S^-1 z of `offsets_at` z, with S their covariance: 1 without model discrepancy."""
+        """z'S^-1 z of `standardised_at` z, with S their covariance: 1 without model discrepancy."""
         if self.process is None:
             return jnp.sum(self.standardised_at(vector, predicted) ** 2)
-        found = self.whitened_at(vector, predicted, self._noise_at(vector, predicted))
+        found = self.whitened_at(vector, predicted)
         return jnp.sum(found.residuals**2) + jnp.sum(found.latent**2)
 
-    def whitened_at(self, vector: Array, predicted: Array, noise: Array, shared: Array | float = 1.0) -> Whitened:
-        """Residuals less the model discrepancy that the data imply, by the scale of the noise.
-
-        shared: factor of the amplitude.
-        """
+    def whitened_at(self, vector: Array, predicted: Array, step: Step = None) -> Whitened:
+        """Residuals less the model discrepancy that the data imply, by the scale of the noise."""
         assert self.process is not None
-        return self.process.whitened(*self._logarithmic(predicted, noise), self._correlation(vector, shared))
+        sigma = self._noise_at(vector, predicted, step)
+        at = self._correlation(vector, step)
+        return self.process.whitened(self._scaled(sigma, predicted), self._relative_at(sigma), at)
 
     def discrepancy_at(self, vector: Array, predicted: Array, places: Array) -> tuple[Array, Array]:
         """The model discrepancy at other `places`, as far as the data tell: mean and sd of the logarithm, (M, C)."""
-        at = self._correlation(vector)
         assert self.process is not None
-        z, relative = self._logarithmic(predicted, self._noise_at(vector, predicted))
-        return self.process.predict(self.process.whitened(z, relative, at), relative, places, at)
+        relative = self._relative_at(self._noise_at(vector, predicted))
+        return self.process.predict(self.whitened_at(vector, predicted), relative, places, self._correlation(vector))
 
     @property
     def logarithmic(self) -> tuple[int, ...]:
         """Places, among `residuals`, of those whose half squares are logarithms of levels of noise."""
         return tuple(range(2, 2 + self.varying + (self.process is not None)))
-
-    def residuals_at(self, vector: Array, predicted: Array) -> tuple[Array, ...]:
-        """Arrays whose half sum of squares is minus the log-posterior up to a constant, or the named objective.
-
-        The first of them is of the data, the second of the prior, those that are left of levels of noise (see
-        `logarithmic`).
-        """
-        return self._residuals(vector, predicted, self._noise_at(vector, predicted))
 
     def initial_sigma(self, vector: Array) -> Array:
         """A scale of the noise, (N, C), in 1/sr, by which no measurement near 0 stands out: a fit begins with it."""
@@ -222,28 +215,14 @@ class Model(eqx.Module):
         typical = jnp.mean(jnp.abs(self.values))  # a tenth of it keeps data near 0 from outweighing all others
         return total_sigma(jnp.abs(self.values) + 0.1 * typical, self.variance, parts.relative, parts.floor)
 
-    def linear_parts(
-        self, vector: Array, first_step: tuple[Array, Array] | None = None, others: bool = False
-    ) -> tuple[tuple[Array, ...], tuple[Array, Array]]:
+    def linear_parts(self, vector: Array, step: Step = None) -> tuple[tuple[Array, ...], tuple[Array, Array]]:
         """`residuals`; and what is predicted, (N, C), with the rows (rows,) of the data's Fisher information.
 
         The Jacobian A of these rows has the Fisher information A'A. The expected information needs first derivatives
         only and is never indefinite; for Gaussian noise that is known it is J'J. For a named objective: its residuals.
-
-        first_step: towards a fit of levels of noise, a scale of it, (N, C), in the place of sigma where it is finite,
-        and how much of the model discrepancy counts. others: whether derivatives are also by parameters that nothing
-        depends on here.
         """
-        alone = self.moving == vector.size and not others
-        predicted = self.predict(vector) if alone else _by_columns(vector, model=self)
-        sigma = self._noise_at(vector, predicted)
-        shared: Array | float = 1.0
-        held = sigma
-        if first_step is not None:
-            fixed_sigma, shared = first_step
-            held = jnp.where(jnp.isfinite(fixed_sigma), fixed_sigma, sigma) if self.varying else sigma
-        rows = self._information_rows(vector, predicted, sigma, shared)
-        return self._residuals(vector, predicted, held, shared), (predicted, rows)
+        predicted = _by_columns(vector, model=self)
+        return self.residuals_at(vector, predicted, step), (predicted, self._information_rows(vector, predicted, step))
 
     def log_likelihood_per_datum_at(self, vector: Array, predicted: Array) -> Array:
         """Normalised log-density of each datum, (N, C); with model discrepancy, given all others."""
@@ -251,9 +230,8 @@ class Model(eqx.Module):
         if self.process is None:
             z = (self.values - predicted) / sigma
             return log_density(z, sigma, self.tails, self.degrees_of_freedom)
-        z, relative = self._logarithmic(predicted, sigma)
-        at = self._correlation(vector)
-        own, precision = self.process.leave_one_out(self.process.whitened(z, relative, at), relative, at)
+        relative, at = self._relative_at(sigma), self._correlation(vector)
+        own, precision = self.process.leave_one_out(self.whitened_at(vector, predicted), relative, at)
         width = sigma / jnp.sqrt(precision)
         return log_density(own / jnp.sqrt(precision), width, self.tails, self.degrees_of_freedom)
 
@@ -262,7 +240,7 @@ class Model(eqx.Module):
         if self.process is None:
             return jnp.sum(self.log_likelihood_per_datum_at(vector, predicted))
         sigma = self._noise_at(vector, predicted)
-        found = self.whitened_at(vector, predicted, sigma)
+        found = self.whitened_at(vector, predicted)
         squares = jnp.sum(found.residuals**2) + jnp.sum(found.latent**2)
         levels = jnp.sum(found.levels) + jnp.sum(jnp.log(sigma))
         return -0.5 * squares - levels - 0.5 * self.values.size * math.log(2.0 * math.pi)
@@ -271,48 +249,54 @@ class Model(eqx.Module):
         assert self.objective != "likelihood"
         return named_residual(self.objective, predicted, self.values, jnp.abs(self.wi[:, 2:]))
 
-    def _noise_at(self, vector: Array, predicted: Array) -> Array:
+    def _noise_at(self, vector: Array, predicted: Array, step: Step = None) -> Array:
         """`sigma_at`; with model discrepancy of the datum, so that it does not depend on what is predicted."""
-        return self.sigma_at(vector, predicted if self.process is None else self.values)
+        sigma = self.sigma_at(vector, predicted if self.process is None else self.values)
+        return sigma if step is None or not self.varying else jnp.where(jnp.isfinite(step[0]), step[0], sigma)
 
-    def _logarithmic(self, predicted: Array, noise: Array) -> tuple[Array, Array]:
-        """Residuals of logarithms, and an error of 1 in a logarithm, in units of the noise, (N, C) each."""
-        relative = size(self.values, self.softness) / noise
-        return relative * (logarithm(predicted, self.softness) - logarithm(self.values, self.softness)), relative
+    def _relative_at(self, sigma: Array) -> Array:
+        """An error of 1 in a logarithm, in units of the noise, (N, C)."""
+        return size(self.values, self.softness) / sigma
 
-    def _correlation(self, vector: Array, shared: Array | float = 1.0) -> Correlation:
+    def _scaled(self, sigma: Array, predicted: Array) -> Array:
+        """Logarithms of what is predicted less those of the data, in units of the noise, (N, C)."""
+        change = logarithm(predicted, self.softness) - logarithm(self.values, self.softness)
+        return self._relative_at(sigma) * change
+
+    def _correlation(self, vector: Array, step: Step = None) -> Correlation:
         at = self.build(vector).correlation
         assert at is not None
-        return at._replace(amplitude=shared * at.amplitude)
+        return at if step is None else at._replace(amplitude=step[1] * at.amplitude)
 
-    def _residuals(
-        self, vector: Array, predicted: Array, sigma: Array, shared: Array | float = 1.0
-    ) -> tuple[Array, ...]:
+    def residuals_at(self, vector: Array, predicted: Array, step: Step = None) -> tuple[Array, ...]:
+        """Arrays whose half sum of squares is minus the log-posterior up to a constant, or the named objective: of the
+        data, of the prior, and those of levels of noise (see `logarithmic`)."""
         if self.objective != "likelihood":
             return (self._named(predicted),)
+        sigma = self._noise_at(vector, predicted, step)
         levels = [sigma_residual(sigma, self.lowest)] if self.varying else []
         if self.process is None:
             data = tail_residual((predicted - self.values) / sigma, self.tails, self.degrees_of_freedom)
         else:
-            found = self.whitened_at(vector, predicted, sigma, shared)
+            found = self.whitened_at(vector, predicted, step)
             data = jnp.concatenate([found.residuals.reshape(-1), found.latent])
             levels.append(level_residual(found.levels))
         return (data, self.box.prior_residuals(vector), *levels)
 
-    def _information_rows(self, vector: Array, predicted: Array, sigma: Array, shared: Array | float) -> Array:
+    def _information_rows(self, vector: Array, predicted: Array, step: Step) -> Array:
         if self.objective != "likelihood":
             return self._named(predicted).reshape(-1)
         of_mean, of_level = information_weights(self.tails, self.degrees_of_freedom)
+        sigma = self._noise_at(vector, predicted)
         levels = [jnp.sqrt(of_level) * jnp.log(sigma).reshape(-1)] if self.varying else []
         if self.process is None:
             rows = (predicted / jax.lax.stop_gradient(sigma)).reshape(-1)
         else:
-            at = self._correlation(vector, shared)
-            held, noise = jax.lax.stop_gradient((at, sigma))
-            z, relative = self._logarithmic(predicted, noise)
-            found = self.process.whitened(z, relative, held)
+            step = None if step is None else (jnp.full_like(step[0], jnp.nan), step[1])
+            found = self.whitened_at(jax.lax.stop_gradient(vector), predicted, step)
             rows = jnp.concatenate([found.residuals.reshape(-1), found.latent])
-            levels.append(self.process.information_rows(relative, at))
+            relative = self._relative_at(jax.lax.stop_gradient(sigma))
+            levels.append(self.process.information_rows(relative, self._correlation(vector, step)))
         return jnp.concatenate([jnp.sqrt(of_mean) * rows, *levels])
 
 
@@ -382,17 +366,14 @@ class JointModel(eqx.Module):
     def residuals_at(self, vector: Array, predicted: Array) -> tuple[Array, ...]:
         return self._together(vector, self._each(Model.residuals_at, vector, predicted))
 
-    def linear_parts(
-        self, vector: Array, first_step: tuple[Array, Array] | None = None
-    ) -> tuple[tuple[Array, ...], tuple[Array, Array]]:
+    def linear_parts(self, vector: Array, step: Step = None) -> tuple[tuple[Array, ...], tuple[Array, Array]]:
         """Each data set is differentiated by its own parameters alone."""
-        steps: list[tuple[Array, Array] | None] = [None] * len(self.parts)
-        if first_step is not None:
-            held, shared = first_step
-            sigmas = [held] * len(self.parts) if held.size == 1 else self._split(held)
-            steps = [(sigma, shared) for sigma in sigmas]
+        steps: list[Step] = [None] * len(self.parts)
+        if step is not None:
+            sigmas = [step[0]] * len(self.parts) if step[0].size == 1 else self._split(step[0])
+            steps = [(sigma, step[1]) for sigma in sigmas]
         each = self._with_vectors(vector)
-        found = [part.linear_parts(own, step, others=True) for (part, own), step in zip(each, steps, strict=True)]
+        found = [part.linear_parts(own, step) for (part, own), step in zip(each, steps, strict=True)]
         predicted, rows = _column([values for _, (values, _) in found]), [rows for _, (_, rows) in found]
         return self._together(vector, [residuals for residuals, _ in found]), (predicted, jnp.concatenate(rows))
 

@@ -12,7 +12,7 @@ constant, so that a least-squares solver maximises the likelihood exactly:
 import math
 from dataclasses import dataclass
 from numbers import Real
-from typing import Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple, cast, get_args
 
 import jax.numpy as jnp
 import numpy as np
@@ -31,6 +31,7 @@ Tails = Literal["gaussian", "student"]
 DEFAULT_RELATIVE = 0.05
 DEFAULT_FLOOR = 1e-4
 CUBE_ROOT_OFFSET = 1e-6
+TINY = 1e-30  # below, log1p(x) / x is 1
 LEVELS = (1e-100, 1e100)  # of a floor, or a scale: their squares neither vanish nor overflow in float64
 DEGREES_OF_FREEDOM = (0.01, 1e6)  # above, a Student-t is a Gaussian, and the terms of its constant cancel
 
@@ -63,8 +64,7 @@ class Noise:
     def __post_init__(self) -> None:
         if self.relative is not None:
             require_number_or_free("Noise.relative", self.relative, 0.0, 1.0)
-        if self.floor is not None and not (isinstance(self.floor, Real) and self.floor == 0.0):
-            require_number_or_free("Noise.floor", self.floor, *LEVELS)
+        require_floor("Noise.floor", self.floor)
         require_switch("Noise.use_sigma", self.use_sigma)
         require_choice("Noise.tails", self.tails, get_args(Tails))
         require_number("Noise.degrees_of_freedom", self.degrees_of_freedom, *DEGREES_OF_FREEDOM)
@@ -76,6 +76,12 @@ class Noise:
             )
         if self.discrepancy and self.tails != "gaussian":
             raise ValueError(f"Noise.tails is {self.tails!r}; with model discrepancy it must be gaussian")
+
+
+def require_floor(name: str, floor: Any) -> None:
+    """ValueError for what is no floor: None, 0, or what has a square that neither vanishes nor overflows."""
+    if floor is not None and not (isinstance(floor, Real) and floor == 0.0):
+        require_number_or_free(name, floor, *LEVELS)
 
 
 def total_sigma(predicted: Array, variance: Array, relative: Array, floor: Array) -> Array:
@@ -96,8 +102,9 @@ def tail_residual(z: Array, tails: Tails, degrees_of_freedom: Array) -> Array:
     """Smooth residual whose half square is the negative log-density of z, less its value at 0."""
     if tails == "gaussian":
         return z
-    nu = degrees_of_freedom
-    return z * jnp.sqrt((nu + 1) / nu * _log1p_ratio(z**2 / nu))
+    nu, x = degrees_of_freedom, z**2 / degrees_of_freedom
+    tame = jnp.where(x > TINY, x, 1.0)
+    return z * jnp.sqrt((nu + 1) / nu * jnp.where(x > TINY, jnp.log1p(tame) / tame, 1.0))
 
 
 def sigma_residual(sigma: Array, lowest: Array) -> Array:
@@ -131,24 +138,12 @@ def named_residual(objective: Objective, predicted: Array, values: Array, cosine
     return jnp.cbrt(predicted * cosine + CUBE_ROOT_OFFSET) - jnp.cbrt(values * cosine + CUBE_ROOT_OFFSET)
 
 
-def _log1p_ratio(x: Array) -> Array:
-    # log1p(x) / x for x >= 0; below the limit four terms leave an error of x^4 / 5, under rounding in float64
-    limit = 1e-4
-    small = x < limit
-    inner = jnp.where(small, x, 0.5 * limit)
-    series = 1.0 - inner * (1 / 2 - inner * (1 / 3 - inner / 4))
-    tame = jnp.where(small, 1.0, x)
-    return jnp.where(small, series, jnp.log1p(tame) / tame)
-
-
 class Levels(NamedTuple):
     """Noise of the used samples: the measurement's own variance, (N, C) or (1,), and the levels of the noise model."""
 
     variance: Floats
     relative: float | Free
     floor: float | Free
-    floor_is_share: bool
-    """Whether the floor is a share of the values, by default."""
 
     @property
     def smallest(self) -> Floats:
@@ -175,7 +170,7 @@ class Levels(NamedTuple):
         """What measurements (N, C) tell of a process of the discrepancy; None where it depends on parameters."""
         if self.fitted:
             return None
-        variance, relative, floor = (jnp.asarray(level) for level in self[:3])
+        variance, relative, floor = map(jnp.asarray, self)
         sigma = total_sigma(jnp.asarray(values), variance, relative, floor)
         return process.gram_of(size(values, self.softness(values)) / sigma)
 
@@ -194,16 +189,14 @@ def noise_levels(noise: Noise, used: Measurements) -> Levels:
     if floor is None:
         alone = not is_free(relative) and relative == 0
         floor = 0.0 if alone else DEFAULT_FLOOR * float(np.median(np.abs(used.values)))
-    return Levels(np.zeros(1) if sigma is None else np.square(sigma), relative, floor, noise.floor is None)
+    return Levels(np.zeros(1) if sigma is None else np.square(sigma), relative, floor)
 
 
 def require_size(levels: Levels) -> None:
-    """Refuse values of which a share has a square that vanishes or overflows."""
-    if not levels.floor_is_share or isinstance(levels.floor, Free) or levels.floor == 0:
-        return
-    precision, median = jnp.finfo(jnp.result_type(float)), levels.floor / DEFAULT_FLOOR
+    """ValueError for values of which a share, the floor by default, has a square that vanishes or overflows."""
+    precision, median = jnp.finfo(jnp.result_type(float)), cast(float, levels.floor) / DEFAULT_FLOOR
     least, most = max(LEVELS[0], math.sqrt(precision.tiny)) / DEFAULT_FLOOR, min(LARGEST, math.sqrt(precision.max))
-    if not least <= median <= most:
+    if levels.floor and not least <= median <= most:
         raise ValueError(
             f"values: the median of |value| is {median:.3g} 1/sr; for noise relative to them it must be in "
             f"[{least:.2g}, {most:.2g}], or Noise.floor be given"

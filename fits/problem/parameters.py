@@ -28,8 +28,6 @@ from layerjax._checks import in_short, require_kind, require_number
 from layerjax._shown import Shown
 from layerjax.mixture import stacks_by_name
 
-FARTHEST_MEAN = 37.0  # standard deviations from the bounds; farther out the density within them underflows in float64
-NARROWEST = 1e-15  # standard deviation, as a share of the distances in the box: below, float64 has no numbers for it
 SMALLEST = float(np.finfo(float).tiny)  # what is smaller is 0 in compiled programs
 _FLAT = 1e-6  # width of the bounds in standard deviations below which a difference of two masses loses its digits
 
@@ -94,45 +92,34 @@ class LogNormal(Prior):
 
 def _require_computable(prior: Prior, low: Floats, high: Floats) -> None:
     """ValueError for bounds, each () or (C,), and a prior whose density within them float64 cannot hold."""
-    bounds = f"[{in_short(low.tolist())}, {in_short(high.tolist())}]"
-    if prior.logarithmic:
-        if np.any(low < SMALLEST):
-            raise ValueError(
-                f"Free.low is {in_short(low.tolist())}; it must be above 0 for the prior {prior}, at least "
-                f"{SMALLEST:.2g}"
-            )
-        low, high = np.log(low), np.log(high)
-    with np.errstate(over="ignore", invalid="ignore"):
-        width = high - low
-        if not np.all(np.isfinite(width) & (width >= SMALLEST)):
-            raise ValueError(f"Free.low and Free.high are {bounds}; float64 must hold their difference")
-        centre, inverse_sd = prior.gaussian()
-        outside = np.maximum(np.maximum(low - centre, centre - high), 0.0)
-        if np.any(outside * inverse_sd > FARTHEST_MEAN):
-            raise ValueError(
-                f"Free.prior is {prior}; its centre must lie within {FARTHEST_MEAN:g} standard deviations of {bounds}"
-            )
-        if np.any(np.maximum(abs(low - centre), abs(high - centre)) * inverse_sd * NARROWEST >= 1.0):
-            raise ValueError(
-                f"Free.prior is {prior}; its sd must be above {NARROWEST:g} of the distance from its centre to {bounds}"
-            )
+    if prior.logarithmic and np.any(low < SMALLEST):
+        words = f"must be above 0 for the prior {prior}, at least {SMALLEST:.2g}"
+        raise ValueError(f"Free.low is {in_short(low.tolist())}; it {words}")
+    centre, inverse_sd = prior.gaussian()
+    with np.errstate(all="ignore"):
+        ends = np.log([low, high]) if prior.logarithmic else np.array([low, high])
+        squares = np.square((ends - centre) * inverse_sd)
+        normalisers = [_log_normaliser(prior, *pair) for pair in zip(low.ravel(), high.ravel(), strict=True)]
+    if not (np.all(np.isfinite(squares)) and np.all(np.isfinite(normalisers))):
+        bounds = f"[{in_short(low.tolist())}, {in_short(high.tolist())}]"
+        raise ValueError(f"Free.prior is {prior}; float64 cannot hold its density between the bounds {bounds}")
 
 
 def _log_normaliser(prior: Prior, low: float, high: float) -> float:
     """Log of the integral of the prior between two bounds, in the coordinate where it is Gaussian or flat."""
     centre, inverse_sd = prior.gaussian()
-    a, b = (math.log(low), math.log(high)) if prior.logarithmic else (low, high)
+    a, b = (np.log(low), np.log(high)) if prior.logarithmic else (low, high)
     if inverse_sd == 0:
-        return math.log(b - a)
+        return float(np.log(b - a))
     width = (b - a) * inverse_sd
     a, b = (a - centre) * inverse_sd, (b - centre) * inverse_sd
     if a > 0:  # both ends in the upper tail: mirror, so that the difference keeps its digits
         a, b = -b, -a
     if width < _FLAT:
-        log_mass = math.log(width) + stats.norm.logpdf(0.5 * (a + b))
+        log_mass = np.log(width) + stats.norm.logpdf(0.5 * (a + b))
     else:
-        log_mass = stats.norm.logcdf(b) + math.log(-math.expm1(stats.norm.logcdf(a) - stats.norm.logcdf(b)))
-    return log_mass - math.log(inverse_sd) + 0.5 * math.log(2 * math.pi)
+        log_mass = stats.norm.logcdf(b) + np.log(-np.expm1(stats.norm.logcdf(a) - stats.norm.logcdf(b)))
+    return float(log_mass - math.log(inverse_sd) + 0.5 * math.log(2 * math.pi))
 
 
 def _random_walk_normaliser(prior: Prior, steps: Floats, normalisers: Floats) -> Floats:
@@ -162,9 +149,7 @@ class Free:
 
     `start`, `low`, `high` are numbers or one per channel (then a prior holds for each channel); the unit is that
     of the number it stands for. Requires low < high, start in [low, high], and low > 0 for `LogNormal` and
-    `LogUniform`. A `Normal` must have its mean within 37 standard deviations of the bounds, and a standard deviation
-    above 1e-15 of the distance from the mean to either bound, so that its density can be computed (`LogNormal`: the
-    same of the logarithms). Each place is a parameter of its own, even where the same object stands twice.
+    `LogUniform`. Each place is a parameter of its own, even where the same object stands twice.
 
     `random_walk_sd` holds channels together: the standard deviation of the difference between neighbours (of the
     logarithms for `LogNormal` and `LogUniform`), one or one for each of the C - 1 steps, say in proportion to the root
@@ -192,28 +177,17 @@ class Free:
             if (value := getattr(self, field)) is not None or field != "random_walk_sd":
                 object.__setattr__(self, field, _plain(f"Free.{field}", value))
         first, lower, upper = self.arrays()
+        low, high = in_short(self.low), in_short(self.high)
         if np.any(lower >= upper):
-            raise ValueError(
-                f"Free.low is {in_short(self.low)} and Free.high is {in_short(self.high)}; low must be below high"
-            )
+            raise ValueError(f"Free.low is {low} and Free.high is {high}; low must be below high")
         if np.any((first < lower) | (first > upper)):
-            raise ValueError(
-                f"Free.start is {in_short(self.start)}; it must lie in [{in_short(self.low)}, {in_short(self.high)}]"
-            )
+            raise ValueError(f"Free.start is {in_short(self.start)}; it must lie in [{low}, {high}]")
         _require_computable(self.prior, lower, upper)
-        if self.random_walk_sd is None:
-            return
-        steps, shape = np.asarray(self.random_walk_sd), self.shape
-        if not shape or shape[0] < 2:
-            raise ValueError(
-                "Free.random_walk_sd is given for a single number; start, low or high must have two channels"
-            )
-        if steps.shape not in ((), (shape[0] - 1,)):
-            raise ValueError(
-                f"Free.random_walk_sd has {steps.size} entries; it must have 1 or {shape[0] - 1}, one a step"
-            )
-        if not np.all(steps > 0.0):
-            raise ValueError(f"Free.random_walk_sd is {in_short(steps.tolist())}; it must be above 0")
+        if self.random_walk_sd is not None:
+            steps, count = np.asarray(self.random_walk_sd), math.prod(self.shape) - 1
+            if not (count and steps.shape in ((), (count,)) and np.all(steps > 0.0)):
+                words = f"must be above 0, one number or one for each of the {count} steps between channels"
+                raise ValueError(f"Free.random_walk_sd is {in_short(self.random_walk_sd)}; it {words}")
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -229,13 +203,11 @@ class Free:
 
     def arrays(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """`start`, `low`, `high` at their common shape."""
+        given = self.start, self.low, self.high
         try:
-            start, low, high = np.broadcast_arrays(*(np.asarray(x, float) for x in (self.start, self.low, self.high)))
+            start, low, high = np.broadcast_arrays(*(np.asarray(one, float) for one in given))
         except ValueError:
-            raise ValueError(
-                f"Free: start {in_short(self.start)}, low {in_short(self.low)} and high {in_short(self.high)} have "
-                "different numbers of channels"
-            ) from None
+            raise ValueError(f"Free: {in_short(given)} have different numbers of channels") from None
         return start, low, high
 
 
@@ -243,11 +215,9 @@ def _plain(field: str, value: Any) -> float | tuple[float, ...]:
     try:
         array = np.asarray(value, dtype=float)
     except (TypeError, ValueError, OverflowError):
-        raise ValueError(f"{field} is {in_short(value)}; it must be a number or one number per channel") from None
-    if array.ndim > 1 or array.size == 0:
-        raise ValueError(f"{field} has shape {array.shape}; it must be a number or one number per channel")
-    if not np.isfinite(array).all():
-        raise ValueError(f"{field} is {in_short(array.tolist())}; it must be finite")
+        array = np.zeros(0)
+    if array.ndim > 1 or array.size == 0 or not np.isfinite(array).all():
+        raise ValueError(f"{field} is {in_short(value)}; it must be a finite number or one per channel")
     return float(array) if array.ndim == 0 else tuple(array.tolist())
 
 

@@ -4,6 +4,7 @@
 """
 
 import abc
+import copy
 import math
 import re
 import warnings
@@ -92,22 +93,24 @@ class FittingProblem(abc.ABC):
         return names_of(self._assembled.free)
 
     @cached_property
+    def _bounds(self) -> list[Floats]:
+        arrays = [one.arrays() for one in self._assembled.free.values()]
+        return [np.concatenate([np.ravel(one) for one in each]) for each in zip(*arrays, strict=True)]
+
+    @property
     def start(self) -> Floats:
         """Where the parameters start, (P,)."""
-        return self._joined(0)
+        return self._bounds[0]
 
-    @cached_property
+    @property
     def low(self) -> Floats:
         """Lower bounds of the parameters, (P,)."""
-        return self._joined(1)
+        return self._bounds[1]
 
-    @cached_property
+    @property
     def high(self) -> Floats:
         """Upper bounds of the parameters, (P,)."""
-        return self._joined(2)
-
-    def _joined(self, place: int) -> Floats:
-        return np.concatenate([one.arrays()[place].ravel() for one in self._assembled.free.values()])
+        return self._bounds[2]
 
     @property
     def units(self) -> dict[str, str]:
@@ -246,22 +249,17 @@ class Problem(FittingProblem):
     def predict_at(self, vectors: ArrayLike, wi: ArrayLike, wo: ArrayLike) -> Array:
         """Scaled BSDF along other directions, (M, 3) each, with D vectors (D, P): (D, M, C), in 1/sr."""
         wi, wo = np.asarray(wi, float), np.asarray(wo, float)
-        model = replace(self.model, **_directions(self, wi, wo))
-        arrays, static = eqx.partition(model, eqx.is_array)
-        return run(_predictions, (arrays, Static(static)), jnp.asarray(vectors))
+        other = self.with_model(replace(self.model, **_directions(self, wi, wo)))
+        return other.call(_predict_each, vectors)
 
     def with_other_rays(self) -> "Problem":
         """The problem with other numbers of rays for the cones of its instrument: what differs is their error."""
-        used, optics = self.data.used(), self.model.optics
-        assert self.instrument is not None
-        assert optics is not None
-        incidences, follow = polar_angles(self.data), optics.known is not None
-        other = optics_of(self.instrument, self.stack, used.wi, used.wo, incidences, follow, other=True)
-        return self.with_model(replace(self.model, optics=other))
+        used = self.data.used()
+        return self.with_model(replace(self.model, **_directions(self, used.wi, used.wo, other_rays=True)))
 
     def with_model(self, model: Model) -> "Problem":
         """The problem with other arrays in its model."""
-        other = replace(self)
+        other = copy.copy(self)  # which takes what `__getstate__` gives
         vars(other)["_assembled"] = self._assembled._replace(model=model)
         return other
 
@@ -331,7 +329,9 @@ class Joint(FittingProblem):
                     raise ValueError(f"Joint.shared: {words} is not free in {part!r}; it must be in every problem")
         common = {name: one for name, one in common.items() if any(_begins(given, name) for given in self.shared)}
         for (name, one), (part, free) in product(common.items(), others):
-            if not _same(one, free[name]):
+            other = free[name]
+            same = one.shape == other.shape and (one.low, one.high, one.prior) == (other.low, other.high, other.prior)
+            if not (same and one.random_walk_sd == other.random_walk_sd):
                 raise ValueError(
                     f"Joint.shared: {name} has other bounds or another prior in {part!r} than in {first!r}"
                 )
@@ -358,28 +358,18 @@ def _begins(prefix: str, name: str) -> bool:
     return name == prefix or name.startswith((f"{prefix}.", f"{prefix}["))
 
 
-def _same(one: Free, other: Free) -> bool:
-    """Whether two parameters have the same bounds and prior."""
-    bounds = (
-        np.broadcast_arrays(mine, theirs) for mine, theirs in zip(one.arrays()[1:], other.arrays()[1:], strict=True)
-    )
-    return (
-        one.shape == other.shape
-        and all(np.allclose(mine, theirs, rtol=1e-12, atol=0.0) for mine, theirs in bounds)
-        and (one.prior, one.random_walk_sd) == (other.prior, other.random_walk_sd)
-    )
-
-
 def _assemble(problem: Problem) -> Assembled:
     """What follows from a problem; ValueError for parts that do not fit together."""
     # 1. each part is of its kind
     _require_kinds(problem)
-    used, noise = problem.data.used(), problem.noise
+    used, noise = problem.data.used(), with_floor(problem.noise, problem.instrument)
     if not used.values.size:
         raise ValueError("data: no sample is used; at least one must be")
 
     # 2. all that a parameter may stand for, in the order of `Parts`
-    levels = noise_levels(with_floor(noise, problem.instrument), used)
+    levels = noise_levels(noise, used)
+    if problem.objective == "likelihood" and noise.floor is None:
+        require_size(levels)
     process = correlation = setting = None
     if isinstance(noise.discrepancy, Discrepancy):
         process = make_process(used.wi, used.wo, used.values.shape[1])
@@ -448,19 +438,16 @@ def _require_kinds(problem: Problem) -> None:
 def _require_weights(objective: Objective, levels: Levels, process: Process | None, free: Mapping[str, Free]) -> None:
     """A likelihood needs noise; beside a named residual nothing may stand that only a likelihood weighs."""
     if objective == "likelihood":
-        require_size(levels)
         if not np.all(levels.smallest > 0):
             raise ValueError("noise: sigma could become 0; give a floor above 0, or data with sigma")
         return
-    fitted = [f"noise.{name}" for name in ("relative", "floor") if is_free(getattr(levels, name))]
-    if fitted or process is not None:
-        raise ValueError(f"{(*fitted, 'noise.discrepancy')[0]}: objective {objective!r} has no noise model to fit")
-    for one in free.values():
-        if isinstance(one.prior, Normal | LogNormal):
-            raise ValueError(f"the prior {one.prior} has no weight beside objective {objective!r}; omit it")
-        if one.random_walk_sd is not None:
-            words = f"Free.random_walk_sd {one.random_walk_sd} has no weight beside objective {objective!r}; omit it"
-            raise ValueError(words)
+    weighed = [f"noise.{name}" for name in ("relative", "floor") if is_free(getattr(levels, name))]
+    weighed += [] if process is None else ["noise.discrepancy"]
+    for name, one in free.items():
+        if isinstance(one.prior, Normal | LogNormal) or one.random_walk_sd is not None:
+            weighed.append(f"the prior of {name}")
+    if weighed:
+        raise ValueError(f"{weighed[0]}: objective {objective!r} weighs neither levels of noise nor priors; omit it")
 
 
 def _with_known(stack: Any) -> Any:
@@ -480,14 +467,15 @@ def _parameter_name(path: str) -> str:
     return plain_name(PLACES[int(index)] + rest)
 
 
-def _directions(problem: Problem, wi: Floats, wo: Floats) -> dict[str, Any]:
-    """What a model holds of measurements along these directions, (N, 3) each."""
+def _directions(problem: Problem, wi: Floats, wo: Floats, other_rays: bool = False) -> dict[str, Any]:
+    """What a model holds of measurements along these directions, (N, 3) each; other_rays: see `optics_of`."""
     transport, optics = problem.transport, None
     # where known directions are of no use, programs should not depend on how many there are
     follow = transport == "auto" or (isinstance(transport, lj.Transport) and transport.uses_known)
     follow = follow and not isinstance(problem.data, Totals)  # whose light leaves along all directions
     if problem.instrument is not None:
-        optics = optics_of(problem.instrument, problem.stack, wi, wo, polar_angles(problem.data), follow)
+        incidences = polar_angles(problem.data)
+        optics = optics_of(problem.instrument, problem.stack, wi, wo, incidences, follow, other_rays)
     return {
         "wi": jnp.asarray(wi),
         "wo": jnp.asarray(wo),
@@ -513,11 +501,11 @@ def polar_angles(data: Measurements) -> Floats:
     return np.round([np.mean(theta[rows]) for rows in groups(theta)], 2)
 
 
-def _predictions(model: Model, vectors: Array) -> Array:
-    return jax.lax.map(model.predict, vectors)
-
-
 def unit(name: str) -> str:
     """The unit of a parameter of this name; "1" for plain ratios."""
     whole = re.sub(r"\[\d+\]$|\.amplitude$", "", name)  # of a channel, or of a power law's reference
     return next((one for end, one in UNITS.items() if whole.endswith(end)), "1")
+
+
+def _predict_each(model: Model, vectors: Array) -> Array:
+    return jax.lax.map(model.predict, vectors)

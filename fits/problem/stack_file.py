@@ -26,20 +26,18 @@
 
     [options]                                  # optional: thresholds of the fit, see `fits.FitOptions`
 
-Keys are the parameters of the classes of the same name; the `kind` of an SGGX is called `shape` here. Bad input is a
-ValueError on one line that names the place (``layers[0].thickness``), what stands there and what may.
+Keys are the parameters of the classes of the same name, which say what may stand there; the `kind` of an SGGX is called
+`shape` here. Bad input is a ValueError on one line that names the place (``layers[0]``) and the parameter.
 """
 
 import difflib
 import inspect
 import math
-import sys
 import tomllib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
-from types import NoneType, UnionType
-from typing import Any, Literal, cast, get_args, get_origin, get_type_hints
+from typing import Any, Literal, cast, get_args
 
 import numpy as np
 import tomli_w
@@ -52,13 +50,11 @@ from fits.problem.instrument import Instrument
 from fits.problem.noise import LEVELS, Noise
 from fits.problem.parameters import Free, LogNormal, LogUniform, Normal, PowerLaw, Prior, Uniform
 from layerjax import gallery
-from layerjax._checks import in_short, require_kind
+from layerjax._checks import in_short, require_kind, require_number
 from layerjax._shapes import require_single
 from layerjax.mixture import require_material
 
-Range = tuple[float, float]
-ANY: Range = (-math.inf, math.inf)
-MOST = 2**31 - 1  # of a whole number: counts are kept in 32 bits
+ANY = (-math.inf, math.inf)
 _LONGEST = 60  # letters of a key that an error suggests others for
 
 MATERIAL = ("gallery", "layers", "base", "mixture")
@@ -67,15 +63,16 @@ MATERIAL = ("gallery", "layers", "base", "mixture")
 _Kinds = Mapping[str, type]
 _LAYERS: _Kinds = {kind.__name__: kind for kind in (lj.Interface, lj.Medium, lj.TurbidMedium)}
 _BASES: _Kinds = {kind.__name__: kind for kind in (lj.Lambertian, lj.OrenNayar, lj.VMFDiffuse, lj.Conductor)}
-_PHASES: _Kinds = {kind.__name__: kind for kind in (lj.HenyeyGreenstein, lj.Rayleigh, lj.SGGX)}
 _TRANSPORTS: _Kinds = {
     name: kind
     for name, kind in vars(lj).items()
     if inspect.isclass(kind) and issubclass(kind, lj.Transport) and not inspect.isabstract(kind)
 }
+_PARTS: Mapping[str, _Kinds] = {
+    "phase": {kind.__name__: kind for kind in (lj.HenyeyGreenstein, lj.Rayleigh, lj.SGGX)},
+    "prior": {kind.__name__: kind for kind in (Uniform, LogUniform, Normal, LogNormal)},
+}
 _LAWS: _Kinds = {"PowerLaw": PowerLaw}
-_PRIORS: _Kinds = {kind.__name__: kind for kind in (Uniform, LogUniform, Normal, LogNormal)}
-_FREE_KEYS = tuple(one.name for one in fields(Free))
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,7 +86,7 @@ class ProblemFile:
     objective: Objective
     instrument: Instrument | None
     options: Mapping[str, Any]
-    about: Mapping[str, str]
+    about: Mapping[str, Any]
     text: str
 
 
@@ -108,12 +105,12 @@ def read_problem(path: str | Path) -> ProblemFile:
         return ProblemFile(
             stack=material_from_dict({key: tables[key] for key in MATERIAL if key in tables}),
             transport=transport_from_dict(tables.get("transport", "auto")),
-            noise=_settings("noise", Noise, tables.get("noise", {})),
-            scale=_one_free("scale", tables["scale"], LEVELS) if "scale" in tables else None,
+            noise=_make("noise", Noise, tables.get("noise", {})),
+            scale=_number("scale", tables["scale"], LEVELS) if "scale" in tables else None,
             objective=cast(Objective, choice("objective", tables.get("objective", "likelihood"), get_args(Objective))),
-            instrument=_settings("instrument", Instrument, tables["instrument"]) if "instrument" in tables else None,
+            instrument=_make("instrument", Instrument, tables["instrument"]) if "instrument" in tables else None,
             options=require_table("options", tables.get("options", {})),
-            about=_about(tables.get("about", {})),
+            about=require_table("about", tables.get("about", {})),
             text=text,
         )
     except (ValueError, RecursionError) as error:
@@ -130,7 +127,7 @@ def read_instrument(path: str | Path) -> Instrument:
     try:
         if "instrument" not in tables:
             raise ValueError("there is no [instrument]")
-        return _settings("instrument", Instrument, tables["instrument"])
+        return cast(Instrument, _make("instrument", Instrument, tables["instrument"]))
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
 
@@ -162,20 +159,13 @@ def write_problem(
     for name, value, kind in (("noise", noise, Noise), ("scale", scale, Free), ("instrument", instrument, Instrument)):
         require_kind(name, value, kind, None)
     choice("objective", objective, get_args(Objective))
-    tables: dict[str, Any] = {}
-    if not isinstance(transport, str):
-        tables["transport"] = transport_to_dict(transport)
-    if objective != "likelihood":
-        tables["objective"] = objective
+    tables = {"transport": transport_to_dict(transport), "objective": objective}
+    tables = {name: value for name, value in tables.items() if value not in ("auto", "likelihood")}
     tables |= material_to_dict(stack)
     material_from_dict(material_to_dict(stack))  # refuses what could not be read again
     transport_from_dict(transport_to_dict(transport))
-    if noise is not None:
-        tables["noise"] = changed_to_dict(noise)
-    if instrument is not None:
-        tables["instrument"] = changed_to_dict(instrument)
-    if scale is not None:
-        tables["scale"] = to_plain(scale)
+    given = {"noise": noise, "instrument": instrument, "scale": scale}
+    tables |= to_plain({name: value for name, value in given.items() if value is not None})
     write_text(path, tomli_w.dumps(tables), force)
 
 
@@ -225,46 +215,19 @@ def material_from_dict(tables: Mapping[str, Any], where: str = "") -> lj.Stack |
             raise ValueError(f"{where}{whole} is a whole material, must stand without {others}")
     if "gallery" in tables:
         return gallery.stack(choice(f"{where}gallery", tables["gallery"], gallery.names()))
-    return _mixture(f"{where}mixture", tables["mixture"]) if "mixture" in tables else stack_from_dict(tables, where)
-
-
-def _mixture(where: str, table: Any) -> lj.Mixture:
-    parts, weights = {}, {}
-    for name, entries in require_table(where, table).items():
+    if "mixture" not in tables:
+        return stack_from_dict(tables, where)
+    where, parts, weights = f"{where}mixture", {}, {}
+    for name, entries in require_table(where, tables["mixture"]).items():
         place = f"{where}.{name}"
         check_keys(place, require_table(place, entries), ("weight", *MATERIAL))
         weight = entries.get("weight")
-        read = _one_free if isinstance(weight, dict) else one_number
-        weights[name] = None if weight is None else read(f"{place}.weight", weight, lj.RANGES["Mixture.weights"])
+        weights[name] = None if weight is None else _number(f"{place}.weight", weight, lj.RANGES["Mixture.weights"])
         parts[name] = material_from_dict({key: entries[key] for key in MATERIAL if key in entries}, f"{place}.")
     try:
         return lj.Mixture(parts, weights)
     except ValueError as error:
         raise ValueError(f"{where}: {error}") from None
-
-
-def _settings(where: str, kind: type, table: Any) -> Any:
-    """The `Noise`, `Instrument` or `Discrepancy` that a table describes."""
-    hints = get_type_hints(kind)
-    check_keys(where, require_table(where, table), tuple(hints))
-    given = {}
-    for key, value in table.items():
-        place = f"{where}.{key}"
-        if key != "discrepancy":
-            given[key] = _value(place, value, hints[key], "")
-        else:
-            given[key] = value if isinstance(value, bool) else _settings(place, Discrepancy, value)
-    try:
-        return kind(**given)
-    except ValueError as error:
-        raise ValueError(str(error).replace("Noise.", "noise.").replace("Instrument.", "instrument.")) from None
-
-
-def _one_free(where: str, table: Any, allowed: Range) -> Free:
-    free = _free(where, table, allowed)
-    if free.shape != ():
-        raise ValueError(f"{where} has {free.shape[0]} channels, must be one number for all")
-    return free
 
 
 def transport_from_dict(value: Any) -> lj.Transport | Literal["auto"]:
@@ -276,129 +239,61 @@ def transport_from_dict(value: Any) -> lj.Transport | Literal["auto"]:
     return cast(lj.Transport, _build("transport", value, _TRANSPORTS))
 
 
-def _about(table: Any) -> dict[str, str]:
-    for key, text in require_table("about", table).items():
-        if not isinstance(text, str):
-            raise ValueError(f"about[{in_short(key)}] is {in_short(text)}, must be a text")
-    return dict(table)
-
-
-# ---- values of tables ----
-
-
 def _build(where: str, table: Any, kinds: _Kinds) -> Any:
     """The object that a table with a `kind` describes."""
-    table = require_table(where, table)
-    if "kind" not in table:
+    if "kind" not in require_table(where, table):
         raise ValueError(f"{where} has no kind, must be one of {', '.join(kinds)}")
     kind = kinds[choice(f"{where}.kind", table["kind"], kinds)]
-    known = {_key(name): (name, parameter) for name, parameter in inspect.signature(kind).parameters.items()}
-    check_keys(where, table, ("kind", *known))
-    hints = get_type_hints(kind)
-    given = {}
-    distribution = table.get("distribution", "ggx")
-    normals = f", {distribution}" if isinstance(distribution, str) and distribution != "ggx" else ""
-    for key, (name, parameter) in known.items():
-        if key in table:
+    return _make(where, kind, {key: value for key, value in table.items() if key != "kind"})
+
+
+def _make(where: str, kind: type, table: Any) -> Any:
+    """The object of this class that a table of its parameters describes; the class itself says what may stand there."""
+    known = {_key(name): parameter for name, parameter in inspect.signature(kind).parameters.items()}
+    check_keys(where, require_table(where, table), tuple(known))
+    for key, parameter in known.items():
+        if parameter.default is inspect.Parameter.empty and key not in table:
+            raise ValueError(f"{where} has no {key}, which {kind.__name__} needs")
+    given = {known[key].name: _value(f"{where}.{key}", key, value) for key, value in table.items()}
+    normals = f", {given['distribution']}" if given.get("distribution", "ggx") != "ggx" else ""
+    for name, value in given.items():
+        if isinstance(value, Free):
             ranged = f"{kind.__name__}.{name}{normals if name == 'alpha' else ''}"
-            given[name] = _value(f"{where}.{key}", table[key], hints[name], ranged)
-        elif parameter.default is inspect.Parameter.empty:
-            raise ValueError(f"{where} ({kind.__name__}) has no {key}")
+            _require_bounds(f"{where}.{_key(name)}", value, lj.RANGES.get(ranged, ANY))
     try:
         return kind(**given)
-    except ValueError as error:
-        raise ValueError(f"{where}: {error}") from None
+    except (ValueError, TypeError, OverflowError) as error:
+        words = f"{error!s:.300}".replace("SGGX.kind", "SGGX.shape").replace("Free.", "")
+        words = words.replace("Noise.", "noise.").replace("Instrument.", "instrument.")
+        raise ValueError(words if words.startswith(f"{where}.") else f"{where}: {words}") from None
 
 
-def _value(where: str, value: Any, hint: Any, name: str) -> Any:
-    """One parameter, read as what its type hint says."""
-    if get_origin(hint) is Literal:
-        return choice(where, value, get_args(hint))
-    alternatives = [kind for kind in get_args(hint) if kind is not NoneType]
-    if isinstance(hint, UnionType) and len(alternatives) == 1:  # an optional value
-        (hint,) = alternatives
-    if hint is bool:
-        return truth(where, value)
-    if hint is int:
-        return whole_number(where, value)
-    if hint is float:
-        return one_number(where, value)
-    if get_origin(hint) is tuple:
-        kinds = get_args(hint)
-        return numbers(where, value) if float in kinds else whole_numbers(where, value, len(kinds))
-    if name.endswith(".phase"):
-        return _build(where, value, _PHASES)
-    if isinstance(value, dict) and "kind" in value:
-        return _build(where, value, _LAWS)
-    read = _free if isinstance(value, dict) else numbers
-    return read(where, value, lj.RANGES.get(name, ANY))
+def _value(where: str, key: str, value: Any) -> Any:
+    """What stands at a key: a number, a word, a list, a part with a `kind`, or something that is free."""
+    if isinstance(value, dict):
+        if key in _PARTS or "kind" in value:
+            return _build(where, value, _PARTS.get(key, _LAWS))
+        return _make(where, Discrepancy if key == "discrepancy" else Free, value)
+    return tuple(value) if isinstance(value, list) else value
 
 
-def _free(where: str, table: Any, allowed: Range = ANY) -> Free:
-    table = require_table(where, table)
-    check_keys(where, table, _FREE_KEYS)
-    for key in ("start", "low", "high"):
-        if key not in table:
-            raise ValueError(f"{where} has no {key}, a free parameter must have start, low and high")
-    settings: dict[str, Any] = {}
-    for key, value in table.items():
-        place = f"{where}.{key}"
-        if key == "prior":
-            settings[key] = _build(place, value, _PRIORS)
-        elif key == "same_for_all_texels":
-            settings[key] = truth(place, value)
-        else:
-            settings[key] = numbers(place, value, ANY if key == "random_walk_sd" else allowed)
-    try:
-        return Free(**settings)
-    except ValueError as error:
-        raise ValueError(f"{where}: {str(error).replace('Free.', '')}") from None
+def _number(where: str, value: Any, allowed: tuple[float, float]) -> Any:
+    """One number, or one that is free."""
+    if not isinstance(value, dict):
+        require_number(where, value, *allowed)
+        return value
+    free = _make(where, Free, value)
+    if free.shape != ():
+        raise ValueError(f"{where} has {free.shape[0]} channels, must be one number for all")
+    _require_bounds(where, free, allowed)
+    return free
 
 
-def numbers(where: str, value: Any, allowed: Range = ANY) -> float | tuple[float, ...]:
-    """One finite number, or a list of them, within the closed range `allowed`."""
+def _require_bounds(where: str, free: Free, allowed: tuple[float, float]) -> None:
     low, high = allowed
-    wanted = "a finite number" if allowed == ANY else f"a number in [{low:g}, {high:g}]"
-    given = value if isinstance(value, list) else [value]
-    for number in given:
-        if isinstance(number, bool) or not isinstance(number, int | float):
-            raise ValueError(f"{where} is {in_short(number)}, must be {wanted}")
-        # whole numbers may be beyond what float can hold
-        if not (abs(number) <= sys.float_info.max and low <= number <= high):
-            word = f"{number:g}" if isinstance(number, float) else in_short(number)
-            raise ValueError(f"{where} is {word}, must be {wanted}")
-    if not given:
-        raise ValueError(f"{where} is an empty list, must be {wanted} or one a channel")
-    return tuple(float(number) for number in given) if isinstance(value, list) else float(value)
-
-
-def one_number(where: str, value: Any, allowed: Range = ANY) -> float:
-    """One finite number within the closed range `allowed`."""
-    number = numbers(where, value, allowed)
-    if isinstance(number, tuple):
-        raise ValueError(f"{where} is {in_short(value)}, must be one number")
-    return number
-
-
-def whole_number(where: str, value: Any) -> int:
-    """A whole number of at most 32 bits; what it may be beyond that is for its owner to say."""
-    if type(value) is not int or abs(value) > MOST:
-        raise ValueError(f"{where} is {in_short(value)}, must be a whole number up to {MOST}")
-    return value
-
-
-def whole_numbers(where: str, value: Any, count: int) -> tuple[int, ...]:
-    """A list of `count` whole numbers of at most 32 bits each, as a tuple; ValueError for anything else."""
-    if not isinstance(value, list) or len(value) != count or any(type(number) is not int for number in value):
-        raise ValueError(f"{where} is {in_short(value)}, must be a list of {count} whole numbers")
-    return tuple(whole_number(f"{where}[{index}]", number) for index, number in enumerate(value))
-
-
-def truth(where: str, value: Any) -> bool:
-    """The value itself, if it is true or false; ValueError for anything else."""
-    if not isinstance(value, bool):
-        raise ValueError(f"{where} is {in_short(value)}, must be true or false")
-    return value
+    for name, one in zip(("start", "low", "high"), free.arrays(), strict=True):
+        if np.any((one < low) | (one > high)):
+            raise ValueError(f"{where}.{name} is {in_short(one.tolist())}, must be a number in [{low:g}, {high:g}]")
 
 
 def choice(where: str, value: Any, allowed: Iterable[str]) -> str:
@@ -435,22 +330,16 @@ def _suggestion(value: Any, allowed: Iterable[str]) -> str:
 # ---- to tables ----
 
 
-def material_to_dict(stack: lj.Stack | lj.Mixture) -> dict[str, Any]:
+def material_to_dict(material: lj.Stack | lj.Mixture) -> dict[str, Any]:
     """The inverse of `material_from_dict`, of plain numbers, strings, lists and dictionaries."""
-    if not isinstance(stack, lj.Mixture):
-        return stack_to_dict(stack)
-    weights = {name: {} if value is None else {"weight": to_plain(value)} for name, value in stack.weights.items()}
-    return {"mixture": {name: weights[name] | material_to_dict(part) for name, part in stack.parts.items()}}
-
-
-def stack_to_dict(stack: lj.Stack) -> dict[str, Any]:
-    """The inverse of `stack_from_dict`."""
-    tables: dict[str, Any] = {}
-    if stack.layers:
-        tables["layers"] = [_module_to_dict(layer) for layer in stack.layers]
-    if stack.base is not None:
-        tables["base"] = _module_to_dict(stack.base)
-    return tables
+    if isinstance(material, lj.Mixture):
+        given = {name: {} if value is None else {"weight": value} for name, value in material.weights.items()}
+        parts = {name: material_to_dict(part) for name, part in material.parts.items()}
+        return {"mixture": {name: to_plain(given[name]) | part for name, part in parts.items()}}
+    tables: dict[str, Any] = (
+        {"layers": [_module_to_dict(layer) for layer in material.layers]} if material.layers else {}
+    )
+    return tables if material.base is None else tables | {"base": _module_to_dict(material.base)}
 
 
 def changed_to_dict(thing: Noise | Instrument | Discrepancy | Free) -> dict[str, Any]:
@@ -475,7 +364,9 @@ def _module_to_dict(module: Any) -> dict[str, Any]:
 
 
 def to_plain(value: Any) -> Any:
-    if isinstance(value, Free):
+    if isinstance(value, dict):
+        return {name: to_plain(one) for name, one in value.items()}
+    if isinstance(value, Free | Noise | Instrument):
         return changed_to_dict(value)
     if isinstance(value, str | bool | int):
         return value

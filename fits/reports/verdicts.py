@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from fits.data.scans import correlation, neighbours
-from fits.optimise.limits import instrument_limits, limited_with
+from fits.optimise.limits import instrument_limits
 from fits.optimise.options import FitOptions
 from fits.optimise.result import OUTCOMES
 from fits.optimise.uncertainty import UNCONSTRAINED_BEYOND, UNIDENTIFIED_BEYOND, Direction
@@ -153,7 +153,7 @@ def assess(fit: "Fit", options: ReportOptions = DEFAULT) -> Assessment:
             ordered = np.sort(np.maximum(ratio, 1.0 / ratio))
         misfit = float(ordered[len(ordered) // 2]), float(ordered[int(0.95 * len(ordered))])
     if likelihood:
-        offsets = np.abs(np.asarray(fit.problem.call(Model.offsets_at, fit.vector, fit.predicted), float))
+        offsets = np.abs(np.asarray(fit.problem.call(Model.standardised_at, fit.vector, fit.predicted), float))
         square = float(np.sum(offsets**2))  # by these parameters
         significant = fit.degrees_of_freedom > 0 and square / freedom - 1.0 > options.significance * spread
         described = not (significant and float(np.median(offsets)) > options.misfit)
@@ -200,7 +200,7 @@ def identifiability(fit: "Fit", options: ReportOptions = DEFAULT) -> dict[str, s
     """
     names, correlation = list(fit.values), np.array(fit.correlation, dtype=float)
     np.fill_diagonal(correlation, 0.0)
-    limits, limited = instrument_limits(fit), limited_with(fit)
+    limits = instrument_limits(fit)
     words = {}
     for index, name in enumerate(names):
         width, error = float(fit.problem.high[index] - fit.problem.low[index]), fit.standard_errors[name]
@@ -212,8 +212,6 @@ def identifiability(fit: "Fit", options: ReportOptions = DEFAULT) -> dict[str, s
             words[name] = f"limited by the instrument: alpha below {limits[name]:.2g}"
         elif name in fit.at_bound:
             words[name] = "at a bound"
-        elif name in limited:
-            words[name] = f"limited by the instrument: correlated with {limited[name][0]}"
         elif math.hypot(*along) > UNIDENTIFIED_BEYOND:
             kind = "unidentified" if math.hypot(*along) > UNCONSTRAINED_BEYOND else "weakly identified"
             words[name] = f"{kind}: see direction {int(np.argmax(along)) + 1}"

@@ -37,6 +37,7 @@ from layerjax.stack import Medium, Stack, is_known, optical_depths
 from layerjax.surfaces import Conductor, Surface
 from layerjax.transport.contract import TEXELS, DeterministicTransport, Side, refuse_vmf
 from layerjax.transport.first_order import ReflectingInterface
+from layerjax.transport.known_directions import Known
 
 LEAST_SHARE = 0.02
 """Added to the energy of every lobe before they are drawn by it: none is missed where its estimate is 0."""
@@ -67,6 +68,10 @@ class WeidlichWilkie(DeterministicTransport):
 
     def prepare(self, stack: Stack) -> Stack:
         return stack
+
+    def for_tracing(self, stack: Stack, known: Known) -> "WeidlichWilkie":
+        """Itself: no number decides what is computed."""
+        return self
 
     def evaluate(self, state: Stack, wi: Vector, wo: Vector, side: Side) -> Channels:
         if side == "transmission":

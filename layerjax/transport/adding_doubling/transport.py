@@ -169,7 +169,8 @@ class AddingDoubling(DeterministicTransport):
             if value is not None and not (isinstance(value, int) and least <= value <= MOST):
                 raise ValueError(f"AddingDoubling.{name}: {value!r:.60} is not a whole number from {least} to {MOST}")
         given = (2, 4) if self.ordinates is None else self.ordinates
-        cosines, azimuths = given if isinstance(given, tuple | list) and len(given) == 2 else (0, 0)
+        pair = isinstance(given, tuple | list) and len(given) == 2 and all(isinstance(one, int) for one in given)
+        cosines, azimuths = given if pair else (0, 0)
         if not (2 <= cosines <= MOST and 4 <= azimuths <= MOST and azimuths % 2 == 0):
             raise ValueError(
                 f"AddingDoubling.ordinates: {self.ordinates!r:.60} is not (cosines from 2 to {MOST}, an even number of "

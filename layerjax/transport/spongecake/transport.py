@@ -15,6 +15,7 @@ from layerjax.directions import Vector
 from layerjax.stack import Interface, Stack, is_known, media_of
 from layerjax.tables import load
 from layerjax.transport.contract import TEXELS, DeterministicTransport, Side
+from layerjax.transport.known_directions import Known
 from layerjax.transport.single_scattering import Media, SingleScattering, choices, density, draw
 from layerjax.transport.spongecake.bending import bend_network
 from layerjax.transport.spongecake.layers import MOST, pair_of
@@ -99,6 +100,10 @@ class SpongeCake(DeterministicTransport):
         scatters = any(not is_known(medium.albedo, 0.0) for medium in first.media)
         second = _second(pair_of(first.media), networks(), bends()) if scatters else None
         return Mapped(first, second, first.base is not None)
+
+    def for_tracing(self, stack: Stack, known: Known) -> "SpongeCake | None":
+        """Itself, but of more media than can be traced."""
+        return self if len(media_of(stack)) <= MOST else None
 
     def evaluate(self, state: Mapped, wi: Vector, wo: Vector, side: Side) -> Channels:
         values = SingleScattering().evaluate(state.first, wi, wo, side)

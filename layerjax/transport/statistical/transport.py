@@ -4,6 +4,7 @@ Each group of paths (reflected at the same layer, any number of turns above) is 
 follow from adding. Over a diffuse base the light that has reached it leaves as a product of two transmittances.
 """
 
+import dataclasses
 from collections.abc import Sequence
 from typing import Any, Literal, get_args
 
@@ -28,6 +29,7 @@ from layerjax.stack import Interface, Medium, Stack
 from layerjax.surfaces import Conductor, Surface
 from layerjax.surfaces.interface import interface_reflection
 from layerjax.transport.contract import TEXELS, DeterministicTransport, Side, refuse_vmf
+from layerjax.transport.known_directions import Known
 from layerjax.transport.statistical.coated_base import is_coated, make_coated
 from layerjax.transport.statistical.diffuse_base import make_diffuse
 from layerjax.transport.statistical.diffuse_lobe import make_diffuse_lobe, why_no_lobe
@@ -53,6 +55,9 @@ from layerjax.transport.statistical.streamed_base import is_streamed, make_strea
 
 INDEX_SLACK = 1e-6
 """Of the logarithm of a ratio of indices: those that are given in single precision are rounded."""
+
+LANES = 8
+"""Numbers that processors work on at once. Of fewer pairs, channels would be what they do so: they are 1 or 3."""
 
 Diffuse = Literal["tables", "exact", "lobe"]
 Energies = tuple[Channels, Channels]
@@ -150,17 +155,27 @@ class Statistical(DeterministicTransport):
                 diffuse = _closed_form(stack)
         return Lit(stack, diffuse, index_below(stack), reference_index(stack), smooth_parts(stack))
 
+    def for_tracing(self, stack: Stack, known: Known) -> "Statistical | None":
+        """Itself, but where alphas are known to be as narrow as can be, which are traced as any others would be."""
+        return None if any(smooth_parts(stack)) or self._solves(stack) else self
+
     def evaluate(self, state: Lit, wi: Vector, wo: Vector, side: Side) -> Channels:
-        parts: list[Channels] = [(jnp.zeros_like(wi[2] * wo[2]),)]
-        if side != "transmission":
-            parts += self._reflections(state, wi, wo, upward=False)
-            if state.diffuse is not None:
-                parts.append(diffuse_part(state.diffuse, wi, wo))
+        def lobes(stack: Stack) -> Channels:
+            one = dataclasses.replace(state, stack=stack)
+            parts: list[Channels] = [(jnp.zeros_like(wi[2] * wo[2]),)]
+            if side != "transmission":
+                parts += self._reflections(one, wi, wo, upward=False)
             if side == "all" and state.passes:
-                parts += self._reflections(state, flip(wi), flip(wo), upward=True)
-        if side != "reflection" and state.passes:
-            parts += self._transmissions(state, wi, wo)
-        return channels.total(parts)
+                parts += self._reflections(one, flip(wi), flip(wo), upward=True)
+            if side != "reflection" and state.passes:
+                parts += self._transmissions(one, wi, wo)
+            return channels.total(parts)
+
+        few = jnp.size(wi[2] * wo[2]) < LANES
+        found = lobes(state.stack) if few else channels.by_channel(lambda stack: lobes(stack)[0], state.stack)
+        if state.diffuse is None or side == "transmission":
+            return found
+        return channels.total([found, diffuse_part(state.diffuse, wi, wo)])
 
     def sample(self, state: Lit, wi: Vector, uniforms: tuple[Array, Array, Array]) -> Vector:
         down = draw(self._lobes(state, wi, False), state.diffuse, wi, uniforms, *_ratios(state))

@@ -130,7 +130,7 @@ def test_a_stack_file_has_the_mark(tmp_path):
     again = read_problem(path)
     assert (again.scale, again.stack.layers[0].phase.g) == (scale, HAZE.phase.g)
     path.write_text("[base]\nkind = 'Lambertian'\nalbedo = { start = 0, low = 0, high = 1, same_for_all_texels = 1 }\n")
-    with pytest.raises(ValueError, match=r"base.albedo.same_for_all_texels is 1, must be true or false"):
+    with pytest.raises(ValueError, match=r"base.albedo: same_for_all_texels: 1 is not True or False"):
         read_problem(path)
     with pytest.raises(ValueError, match=r"Free.same_for_all_texels: 'yes' is not True or False"):
         fits.Free(0.5, 0.0, 1.0, same_for_all_texels="yes")  # type: ignore[arg-type]

@@ -14,7 +14,7 @@ from fits.problem.discrepancy import Discrepancy, log_scales, places
 from fits.problem.noise import Noise
 from fits.problem.parameters import Free
 from fits.problem.problem import Problem
-from fits.reports import tables, verdicts
+from fits.reports import verdicts
 from fits.reports.results import load_fit, save_fit
 from fits.sampling.posterior import Posterior
 from tests.helpers.models import line
@@ -97,11 +97,6 @@ def test_both_are_told(wrong):
     assert "neighbouring residuals correlate by +0." in words
     assert "Set `discrepancy = false` to disable it" in words
     assert f"Model discrepancy: {100.0 * wrong.values['noise.discrepancy.amplitude']:.2g} % of the BSDF" in words
-    table = tables.parameter_table(wrong, both=True)
-    place = table.columns.index("independent noise")
-    before = {row[0]: row[place] for row in table.rows if row[place]}
-    assert list(before) == ["['a']", "['b']"]
-    assert float(before["['a']"].split()[0]) == pytest.approx(wrong.without_discrepancy.values["['a']"], rel=0.01)
     # two starts with independent noise, then one from each of their minima and two more with the discrepancy
     starts = sum(wrong.start_outcomes.values())
     assert starts > 2

@@ -7,7 +7,6 @@ import pytest
 
 import layerjax as lj
 from fits.data.geometry import slices
-from fits.data.scans import incidences, signed_angle
 from fits.optimise import multi_start as starts_module
 from fits.optimise import resolution as resolution_module
 from fits.optimise.fit import fit
@@ -18,8 +17,6 @@ from fits.problem.parameters import Free
 from fits.problem.problem import Problem
 from fits.problem.simulate import simulate
 from fits.reports import results, verdicts
-from fits.reports.html import FitReport
-from fits.reports.plots.model import curves_picture
 from tests.helpers.models import LINE, TRUTH, line, line_data
 
 GEOMETRY = slices(incidence=(20, 50), outgoing=np.arange(-60, 61, 20))
@@ -110,18 +107,6 @@ def test_a_fit_resumes_with_the_starts_that_are_done_and_is_kept_with_its_resolu
         assert (other.resolution, other.numerical_error) == (found.resolution, found.numerical_error)
 
 
-def test_a_report_tells_the_error_and_draws_the_values_of_the_fit(refined):
-    found, _ = refined
-    text = FitReport(found).page()
-    assert f"AddingDoubling, {found.resolution}" in text
-    assert verdicts.numerical_error(found.numerical_error) in text
-    figure = curves_picture({"fit": found})
-    (curve,) = (line for line in figure.axes[0].lines if line.get_label() == "model")
-    rows = incidences(found.problem.data)[0].rows
-    drawn = np.interp(signed_angle(found.problem.data)[rows], *curve.get_data())
-    np.testing.assert_allclose(drawn, found.predicted[rows, 0], rtol=1e-6)
-
-
 def coated(index, alpha):
     flakes = lj.SGGX("surface", alpha=alpha)
     return lj.Stack([lj.Interface(ior=index, alpha=0.1), lj.Medium(thickness=1.0, albedo=0.9, phase=flakes)])
@@ -151,33 +136,15 @@ def test_modes_are_refined_alone_where_nodes_will_do(monkeypatch):
     assert known.in_words(only) == "12 nodes, 24 modes"
     assert known.partly_finer(here, only) == []
 
-    class Alike(resolution_module.Values):
-        """A model that nodes change nothing of: its error falls with the modes."""
-
-        def __init__(self):
-            self._known = {}
-
-        def error(self, transport, other):
-            return abs(36 - transport.modes) / 36 if transport.modes != other.modes else 0.0
+    def error(transport, other):
+        """Of a model that nodes change nothing of: it falls with the modes."""
+        return abs(36 - transport.modes) / 36 if transport.modes != other.modes else 0.0
 
     monkeypatch.undo()
-    needed, error, finest = resolution_module.needed_resolution(
-        known, here, Alike(), DEFAULT.numerical_error, lambda *_: None
-    )
+    needed, error, finest = resolution_module.needed_resolution(known, here, error, DEFAULT.numerical_error)
     assert (needed.nodes, finest) == (12, False)
     assert needed.modes > 30
     assert error <= DEFAULT.numerical_error
-
-
-def test_what_is_given_in_part_stays():
-    given = lj.AddingDoubling(modes=4)
-    chosen = lj.AddingDoubling(nodes=12, modes=4, ordinates=(6, 8))
-    known = resolution_module.Resolutions(given, chosen, tilted=False)
-    assert known.open
-    assert known.in_words(known.finer(chosen)) == "16 nodes, 4 modes"
-    tilted = resolution_module.Resolutions(lj.AddingDoubling(nodes=8, modes=8), chosen, tilted=True)
-    assert tilted.open
-    assert tilted.in_words(tilted.finer(chosen)) == "8 cosines, 12 azimuths"
 
 
 def test_errors_count_in_fitted_noise_levels_or_the_scatter_about_a_named_objective():

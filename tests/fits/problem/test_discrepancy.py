@@ -8,8 +8,7 @@ from scipy import stats
 
 from fits.data.geometry import slices
 from fits.data.measurements import Measurements, channel_names
-from fits.optimise.levenberg_marquardt import evaluate_at
-from fits.problem.discrepancy import Correlation, Discrepancy, _roots_of, make_process, places
+from fits.problem.discrepancy import Correlation, Discrepancy, make_process, places
 from fits.problem.model import Model
 from fits.problem.noise import Noise
 from fits.problem.parameters import Free, LogNormal
@@ -27,7 +26,6 @@ LAYOUTS = {
 
 MANY = {
     "six incidences": slices([5.0, 20.0, 35.0, 50.0, 60.0, 70.0], np.linspace(-85.0, 85.0, 100)),
-    "five planes": slices([10.0, 30.0, 50.0, 70.0], np.linspace(-80.0, 80.0, 35), np.arange(0.0, 180.0, 36.0)),
 }
 
 
@@ -114,27 +112,23 @@ def logarithms(of: Problem) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.mark.parametrize("channels", [1, 3])
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_likelihood_is_that_of_the_dense_matrix(layout: str, channels: int) -> None:
+def test_likelihoods_of_all_and_of_each_given_the_others_are_those_of_the_dense_matrix(
+    layout: str, channels: int
+) -> None:
     """So few measurements are all inducing points."""
     of = problem(layout, channels)
-    for vector in (of.start, 0.3 * of.start + 0.7 * of.low, 0.5 * (of.low + of.high)):
+    where, slopes = logarithms(of)
+    for vector in (of.start, 0.5 * (of.low + of.high)):
         mean, covariance = dense(of, vector)
-        where, slopes = logarithms(of)
         expected = stats.multivariate_normal(mean, covariance).logpdf(where) + np.sum(slopes)
         # the kernels' jitter is 1e-8 of variances up to 1e3 times those of the noise
         assert float(of.log_likelihood(vector)) == pytest.approx(expected, abs=1e-3)
-
-
-@pytest.mark.parametrize("layout", ["two planes", "both sides"])
-def test_each_reading_given_all_others(layout: str) -> None:
-    of = problem(layout, 2)
     mean, covariance = dense(of, of.start)
     precision = np.linalg.inv(covariance)
-    where, slopes = logarithms(of)
-    own = precision @ (where - mean)
     width = 1.0 / np.sqrt(np.diagonal(precision))
-    expected = stats.norm.logpdf(own * width) - np.log(width) + slopes
-    np.testing.assert_allclose(np.ravel(of.log_likelihood_per_datum(of.start)), expected, atol=1e-4)
+    expected = stats.norm.logpdf(precision @ (where - mean) * width) - np.log(width) + slopes
+    found = of.log_likelihood_per_datum(of.start)
+    np.testing.assert_allclose(np.ravel(found), expected, atol=1e-4)
 
 
 def test_places_are_the_half_vector_and_difference() -> None:
@@ -206,22 +200,6 @@ def test_half_squares_are_minus_the_log_posterior() -> None:
     np.testing.assert_allclose(np.add(halves, heights), halves[0] + heights[0], rtol=1e-10)
 
 
-def test_readings_below_their_noise_are_taken_as_they_are() -> None:
-    """Dark readings, of both signs: what is told of them is what Gaussian noise about the model tells."""
-    of = problem("one scan", amplitude=1e-6)
-    generator = np.random.default_rng(4)
-    values = 1e-3 * generator.standard_normal(of.data.values.shape)
-    dark = along(of.data, values, 1e-3)
-    stack = {"a": Free(1e-4, 0.0, 1e-3), "colour": 1e-3}
-    noises = (Noise(discrepancy=Discrepancy(amplitude=1e-6)), Noise())
-    shared, plain = (Problem(stack, dark, transport, noise) for noise in noises)
-    levels = [[float(of.log_likelihood([a, *of.start[1:]])) for a in (1e-4, 1e-3)] for of in (shared, plain)]
-    # of a reading of x = d / s, s four sigma, residuals about 0 are sqrt(1 + x^2) asinh(x) / x = 1 + x^2 / 3 times
-    # those without the logarithm; the model is a tenth of sigma
-    np.testing.assert_allclose(levels[0], levels[1], atol=1.3 * np.sum((values / 1e-3) ** 4) / 48.0)
-    assert np.diff(levels[0]) == pytest.approx(np.diff(levels[1]), abs=0.1)
-
-
 def test_information_is_that_of_the_covariance() -> None:
     """tr(S^-1 dS S^-1 dS) / 2 by finite differences of the dense covariance."""
     of = problem("two planes", 2)
@@ -244,7 +222,7 @@ def test_information_is_that_of_the_covariance() -> None:
 
 
 @pytest.mark.parametrize("relative", [0.01, Free(0.02, 1e-4, 0.1)])
-@pytest.mark.parametrize("end", ["low", "high", "start"])
+@pytest.mark.parametrize("end", ["low", "high"])
 def test_derivatives_at_the_ends(end: str, relative: float | Free) -> None:
     of = problem("two planes", 2, relative)
     vector = getattr(of, end)
@@ -259,17 +237,6 @@ def test_derivatives_at_the_ends(end: str, relative: float | Free) -> None:
             assert slope[index] == pytest.approx((4.0 * middle - 3.0 * low - high) / (2.0 * step), rel=1e-4, abs=1e-3)
 
 
-def test_gradient_of_the_fit_is_that_of_its_cost() -> None:
-    of = problem("two incidences", 2)
-    unit = np.asarray(of.model.box.to_unit(jnp.asarray(of.start)))
-    found = evaluate_at(of, unit)
-
-    def cost(model: Model, s: jax.Array) -> jax.Array:
-        return 0.5 * sum(jnp.sum(part**2) for part in model.residuals(model.box.from_unit(s)))
-
-    np.testing.assert_allclose(found.gradient, of.call(lambda m, s: jax.grad(lambda t: cost(m, t))(s), unit), rtol=1e-8)
-
-
 def test_what_is_given_is_no_parameter() -> None:
     every = tuple(f"noise.discrepancy.{name}" for name in Correlation._fields)
     assert problem("one scan").names == ("['a']", *every[:4])
@@ -282,26 +249,12 @@ def test_what_is_given_is_no_parameter() -> None:
     assert (own.low[1], own.high[1]) == (0.01, 0.2)
 
 
-def test_readings_all_over_the_hemisphere_are_carried() -> None:
-    generator = np.random.default_rng(0)
-    wi, wo = (v / np.linalg.norm(v, axis=-1, keepdims=True) for v in generator.standard_normal((2, 500, 3)))
-    process = make_process(np.abs(wi), np.abs(wo))
-    assert len(process.where) == 170
-    assert np.all(np.isfinite(process.weights))
-    for channels, count in ((3, 133), (30, 80)):
-        assert len(make_process(np.abs(wi), np.abs(wo), channels).where) == count
-
-
 @pytest.mark.parametrize(
     ("call", "message"),
     [
         (lambda: Noise(tails="student", discrepancy=True), "Noise.tails is 'student'; with model discrepancy it must"),
         (lambda: Noise(discrepancy=0.3), "Noise.discrepancy is 0.3; it must be true, false or Discrepancy"),
         (lambda: Discrepancy(amplitude=-0.1), r"discrepancy.amplitude is -0.1; it must be a number in \[1e-06, 1\]"),
-        (lambda: Discrepancy(length_half=Free(20.0, 0.0, 50.0)), r"length_half.low is 0.0; .* in \[0.1, 360\]"),
-        (lambda: Discrepancy(channel_correlation=1.5), r"channel_correlation is 1.5; it must be a number in \[0, 1\]"),
-        (lambda: Discrepancy(length_difference=Free((20.0, 20.0), 1.0, 50.0)), "length_difference has 2 channels"),
-        (lambda: Discrepancy(length_half="wide"), "Noise.discrepancy.length_half is 'wide'"),
     ],
 )
 def test_refused(call, message: str) -> None:
@@ -311,9 +264,13 @@ def test_refused(call, message: str) -> None:
 
 def test_a_smooth_process_has_a_root_in_single_precision() -> None:
     """Without room for its rounding on the diagonal the root was NaN, and with it every prediction."""
-    numbers, where = [0.1, 40.0, 40.0, 1.0], places(MANY["six incidences"].wi, MANY["six incidences"].wo)[::4]
+    process = make_process(MANY["six incidences"].wi, MANY["six incidences"].wo)
+    white = np.random.default_rng(0).standard_normal((1, len(process.where)))
     double, single = (
-        _roots_of(jnp.asarray(numbers, kind), jnp.asarray(where, kind), 1).inducing_points
+        jax.tree.map(
+            lambda x, kind=kind: jnp.asarray(x, kind), (process, white, Correlation(0.1, 40.0, 40.0, 1.0, 0.0))
+        )
         for kind in (jnp.float64, jnp.float32)
     )
-    np.testing.assert_allclose(single @ single.T, double @ double.T, atol=1e-3 * float(jnp.max(double) ** 2))
+    found, rough = (one.sample(numbers, at) for one, numbers, at in (double, single))
+    np.testing.assert_allclose(rough, found, atol=1e-2 * float(jnp.max(jnp.abs(found))))

@@ -12,12 +12,10 @@ import layerjax as lj
 from benchmarks.measuring.cones import mean_over_cones
 from benchmarks.measuring.repeats import fit_many
 from fits.data.geometry import direction
-from fits.optimise.limits import limited_with
 from fits.problem.instrument import Instrument
 from fits.problem.model import Model
 from fits.problem.parameters import Free, LogNormal, LogUniform
 from fits.problem.problem import Problem
-from fits.reports import verdicts
 from tests.helpers.models import along
 
 SINGLE = lj.SingleScattering()
@@ -64,14 +62,6 @@ def test_means_are_taken_only_where_a_lobe_may_be_narrow() -> None:
     assert np.all(counts[0][(GEOMETRY.theta_i < 11.0) & ~steep] == 1)
     assert np.all(counts[1][tilt < 5.0] >= 4)
     assert np.all(counts[1][(tilt > 30.0) & ~steep] == 1)
-
-    def operations(instrument: Instrument | None, low: float) -> float:
-        of = problem(instrument, low, fits.slices([10.0, 40.0], np.arange(-60.0, 61.0, 4.0)))
-        lowered = jax.jit(lambda vector: of.model.predict(vector)).lower(of.start)
-        return float(lowered.cost_analysis()["flops"])
-
-    assert operations(Instrument(detector_aperture=3.0), 0.06) < 4.2 * operations(None, 0.06)
-    assert operations(Instrument(detector_aperture=0.5), 0.5) == operations(None, 0.5)
 
 
 @pytest.mark.parametrize("free", [False, True])
@@ -168,12 +158,19 @@ def test_instruments_are_kept_with_a_fit(tmp_path: Path) -> None:
         ({"tilt": Free(0.0, -20.0, 5.0)}, r"Instrument.tilt.low is -20.0; it must be a number in \[-10, 10\]"),
         ({"gain_sd": 0.0}, r"Instrument.gain_sd is 0.0; it must be a number in \[0.0001, 1\]"),
         ({"gain_sd": True}, "Instrument.gain_sd is True"),
+        ({"floor": 1e-200}, r"Instrument.floor is 1e-200; it must be a number in \[1e-100, 1e\+100\]"),
         ({"rings": 1.5}, "Instrument.rings: 1.5 is not a whole number from 1 to 8"),
     ],
 )
 def test_bad_instruments_are_refused(given: dict, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         Instrument(**given)
+
+
+def test_there_is_one_floor() -> None:
+    data = along(GEOMETRY)
+    model = Problem(metal(Free(0.2, 0.02, 1.0)), data, SINGLE, fits.Noise(0.0), instrument=Instrument(floor=1e-3)).model
+    np.testing.assert_allclose(model.sigma_at(np.array([0.2]), data.values), 1e-3)
     with pytest.raises(ValueError, match=r"Noise.floor and Instrument.floor are both given"):
         problem(Instrument(floor=1e-3))
 
@@ -186,7 +183,7 @@ def width_of(alpha: float) -> float:
     return 4.0 * np.degrees(np.arctan(0.6436 * alpha))
 
 
-@pytest.mark.parametrize("ratio", [0.2, 0.7, 1.0, 1.4, 3.0])
+@pytest.mark.parametrize("ratio", [0.2, 1.0, 1.4, 3.0])
 @pytest.mark.parametrize("split", [(0.0, 1.0), (0.6, 0.8)])
 def test_readings_are_right_to_a_thousandth_of_the_peak(ratio: float, split: tuple[float, float]) -> None:
     alpha = 0.02
@@ -227,12 +224,6 @@ def test_a_fit_takes_the_rays_that_the_lobe_asks_for_and_counts_what_is_left() -
     assert np.max(error / (0.01 * expected + 1e-4)) <= found.numerical_error + 1e-3
     assert found.numerical_error <= 0.1
     assert "rings of rays a cone" in found.status
-    # what the width of the unidentified lobe decides is named beside it
-    words = verdicts.identifiability(found)
-    assert words["base.k"] == "limited by the instrument: correlated with base.alpha"
-    lines, _, sound = verdicts.verdict(found)
-    assert "base.k and base.alpha are limited by the instrument" in lines[2]
-    assert not sound
     # few rays again, as given: the error is told, and is what they lack
     few = fits.fit(FREE, data, transport=SINGLE, noise=NOISE, instrument=replace(seen, rings=1), starts=4)
     exact = mean_over_cones(few.stack, data.wi, data.wo, 0.0, seen.detector_aperture)
@@ -246,20 +237,3 @@ def test_a_broad_lobe_keeps_four_rays() -> None:
     found = fits.fit(FREE, data, transport=SINGLE, noise=NOISE, instrument=seen, starts=2)
     assert found.problem.instrument == replace(seen, rings=1)
     assert np.max(np.bincount(np.asarray(found.problem.model.optics.row))) == 4
-    assert limited_with(found) == {}
-
-
-@pytest.mark.slow
-def test_what_a_lobe_decides_is_named_also_where_its_width_is_at_a_bound() -> None:
-    """The albedo of a matt part beside it is not: readings far from the lobe know it."""
-    data, seen = through(0.004, 8.0)
-    parts = {
-        "metal": metal(Free(0.01, 5e-3, 0.1), Free(3.0, 1.0, 8.0)),
-        "matt": lj.Stack([], lj.Lambertian(Free(0.4, 0.0, 1.0))),
-    }
-    share = lj.Mixture(parts, [0.5, 0.5])
-    matt = 0.5 * np.pi**-1 * 0.3
-    dim = replace(data, values=0.5 * data.values + matt)
-    found = fits.fit(share, dim, transport=SINGLE, noise=NOISE, instrument=seen, starts=2)
-    assert "metal.base.alpha" in found.at_bound
-    assert list(limited_with(found)) == ["metal.base.k"]

@@ -11,7 +11,6 @@ from scipy import integrate, special, stats
 
 import fits
 import layerjax as lj
-from benchmarks.measuring.repeats import fit_many
 from fits.problem.parameters import Box, Free, LogNormal, LogUniform, Normal, PowerLaw, Uniform, names_of, split
 from fits.problem.problem import Joint, Problem
 from tests.helpers.models import along
@@ -38,44 +37,33 @@ def law(**changed) -> PowerLaw:
     ("call", "message"),
     [
         (lambda: Free(0.5, 1.0, 0.0), "low must be below high"),
-        (lambda: Free(0.5, 0.5, 0.5), "low must be below high"),
         (lambda: Free(2.0, 0.0, 1.0), r"Free.start is 2.0; it must lie in \[0.0, 1.0\]"),
-        (lambda: Free([0.1, 2.0], 0.0, 1.0), "Free.start"),
-        (lambda: Free(np.nan, 0.0, 1.0), "Free.start is nan; it must be finite"),
-        (lambda: Free(0.5, 0.0, np.inf), "Free.high is inf; it must be finite"),
-        (lambda: Free("half", 0.0, 1.0), "Free.start is 'half'; it must be a number"),
+        (lambda: Free(np.nan, 0.0, 1.0), "Free.start is nan; it must be a finite number"),
+        (lambda: Free("half", 0.0, 1.0), "Free.start is 'half'; it must be a finite number"),
         (lambda: Free([0.1, 0.2], [0.0, 0.0, 0.0], 1.0), "different numbers of channels"),
         (lambda: Free(0.5, 0.0, 1.0, LogNormal(1.0, 0.1)), "Free.low is 0.0; it must be above 0 for the prior"),
         (lambda: Free(0.5, 0.0, 1.0, "flat"), "Free.prior: 'flat' is not a Uniform or"),
-        (lambda: Free(10**400, 0.0, 1.0), "Free.start is 1000.*; it must be a number"),
-        (lambda: Free(1.0, -1e308, 1e308), "float64 must hold their difference"),
+        (lambda: Free(10**400, 0.0, 1.0), "Free.start is 1000.*; it must be a finite number"),
+        (lambda: Free(1.0, -1e308, 1e308), r"float64 cannot hold its density between the bounds \[-1e\+308, 1e\+308\]"),
         (lambda: Free(1e-310, 1e-310, 1.0, LogUniform()), "it must be above 0 for the prior .*, at least 2.2e-308"),
-        (lambda: Free(0.5, [0.0, 0.4], 1.0, Normal(-0.3, 0.01)), r"within 37 standard deviations of \[\[0.0, 0.4\], "),
-        (lambda: Free(0.5, 0.0, 1.0, Normal(1.38, 0.01)), "must lie within 37 standard deviations"),
-        (lambda: Free(1.0, 0.5, 2.0, LogNormal(0.5 * np.exp(-0.38), 0.01)), "must lie within 37 standard deviations"),
-        (lambda: Free(0.5, 0.0, 1.0, Normal(0.5, 1e-16)), "its sd must be above 1e-15"),
-        (lambda: Free(1.0, 0.0, 2.0, None, 0.1), "Free.random_walk_sd is given for a single number"),
-        (lambda: Free((1.0, 1.0), 0.0, 2.0, None, (0.1, 0.2)), "random_walk_sd has 2 entries; it must have 1 or 1"),
-        (lambda: Free((1.0, 1.0), 0.0, 2.0, None, 0.0), "Free.random_walk_sd is 0.0; it must be above 0"),
+        (
+            lambda: Free(0.5, 0.0, 1.0, Normal(1e300, 1e-300)),
+            r"Free.prior is Normal\(.*float64 cannot hold its density",
+        ),
+        (lambda: Free(1.0, 0.0, 2.0, random_walk_sd=0.1), "Free.random_walk_sd is 0.1; .* each of the 0 steps"),
+        (
+            lambda: Free((1.0, 1.0), 0.0, 2.0, random_walk_sd=(0.1, 0.2)),
+            r"random_walk_sd is \(0.1, 0.2\).* of the 1 st",
+        ),
         (lambda: Normal(0.0, 0.0), r"Normal.sd is 0.0; it must be a number in \(0, inf\)"),
-        (lambda: Normal(np.nan, 1.0), "Normal.mean is nan; it must be a number in"),
-        (lambda: Normal((0.1, 0.2, 0.3), 0.05), r"Normal.mean is \(0.1, 0.2, 0.3\); it must be a number"),
         (lambda: LogNormal(-1.0, 1.0), r"LogNormal.median is -1.0; it must be a number in \(0, inf\)"),
-        (lambda: LogNormal(1.0, -1.0), "LogNormal.sd is -1.0"),
         (lambda: law(wavelengths=(500.0,)), "PowerLaw.wavelengths has shape"),
-        (lambda: law(wavelengths=(500.0, -1.0), reference=500.0), "PowerLaw.wavelengths is .* finite and above 0"),
         (lambda: law(reference=0.0), "PowerLaw.reference is .*must be finite and above 0"),
         (lambda: law(amplitude=1.0, exponent=1.0), "PowerLaw: nothing is free"),
-        (lambda: law(amplitude=Free((1.0, 2.0), 0.0, 3.0)), "PowerLaw.amplitude has 2 channels"),
-        (lambda: law(exponent=(1.0, 2.0, 3.0)), r"PowerLaw.exponent is \(1.0, 2.0, 3.0\); it must be a number"),
         (lambda: law(amplitude=Free(1.0, -1.0, 3.0)), r"PowerLaw.amplitude.low is -1.0; .* in \[0, inf\]"),
         (
             lambda: problem(lj.Stack([], lj.Lambertian(law()))),
             "base: within the bounds of its power law Lambertian.albedo",
-        ),
-        (
-            lambda: problem(lj.Stack([], lj.OrenNayar(0.5, law(amplitude=Free(0.1, 0.05, 0.2), exponent=0.0)))),
-            r"base.roughness of shape \(4,\) makes it a map",
         ),
         (lambda: problem(paint(law(), Free((0.5,) * 3, 0.1, 5.0))), r"mu_s has 4, layers\[0\].mu_a has 3"),
         (lambda: problem(paint(law(wavelengths=WAVELENGTHS[:3]))), "stack: it has 3 channels, the data 4"),
@@ -103,7 +91,7 @@ def test_prior_density_is_scipys(name: str) -> None:
 
 
 @pytest.mark.parametrize("mean", [-0.36, 0.7])
-@pytest.mark.parametrize("sd", [0.01, 1.0, 0.9e6, 1.1e6, 1e300])
+@pytest.mark.parametrize("sd", [0.01, 0.9e6, 1.1e6, 1e300])
 def test_priors_near_the_limits_are_computed(mean: float, sd: float) -> None:
     box = Box.of([Free(0.5, 0.0, 1.0, Normal(mean, sd))])
     density = jax.jit(lambda x: jnp.exp(box.log_prior(x[None])))
@@ -179,17 +167,6 @@ def test_a_power_law_is_recovered(exact: np.ndarray) -> None:
     np.testing.assert_allclose(fit.stack.layers[0].mu_s, 6.0 * (np.array(WAVELENGTHS) / 600.0) ** -1.5, rtol=1e-6)
 
 
-def test_its_errors_are_honest_and_smaller_than_those_of_free_channels(exact: np.ndarray) -> None:
-    noisy = exact * (1.0 + 0.02 * np.random.default_rng(3).standard_normal((200, *exact.shape)))
-    tied = fit_many(problem(paint(law(reference=600.0)), exact), noisy)
-    pulls = (tied.vectors - [6.0, 1.5]) / tied.standard_errors
-    assert np.abs(pulls.mean(axis=0)).max() < 3.5 / np.sqrt(200)
-    np.testing.assert_allclose(pulls.std(axis=0), 1.0, atol=3.5 / np.sqrt(400))
-    free = fit_many(problem(paint(Free((4.0,) * 4, 0.1, 50.0)), exact), noisy[:5])
-    relative = [found.standard_errors[:5] / found.vectors[:5] for found in (tied, free)]
-    assert relative[0][:, 0].max() < 0.7 * relative[1][:, 1].min()  # at 600 nm, and of the channel at 550 nm
-
-
 def test_the_reference_is_the_geometric_mean() -> None:
     assert law().reference == pytest.approx(stats.gmean(WAVELENGTHS))
     low, high = law(exponent=1.0, amplitude=Free(4.0, 1.0, 9.0), reference=450.0).extremes()
@@ -211,20 +188,6 @@ def test_a_random_walk_has_the_density_of_neighbours_differences() -> None:
         box = Box.of([Free((2.0, 2.0, 2.0), 1e-6, 1e3, prior, random_walk_sd=0.1)])
         expected = stats.multivariate_normal([mean] * 3, covariance).logpdf(natural) - jacobian
         assert float(box.log_prior(x)) == pytest.approx(expected)
-
-
-def test_a_random_walk_draws_a_channel_to_its_neighbours(exact: np.ndarray) -> None:
-    """More so the narrower it is; and what is tied is known better."""
-    values = exact.copy()
-    values[:, 1] *= 1.3
-    data, wide = problem(paint(law()), values).data, fits.Noise(relative=0.5, floor=1e-6, discrepancy=False)
-    alone, tied, rigid = (
-        fits.fit(walk(steps), data, transport=SINGLE, noise=wide, starts=1) for steps in (None, 0.3, 1e-4)
-    )
-    fitted = [np.log(list(fit.values.values())) for fit in (alone, tied, rigid)]
-    roughness = [np.abs(np.diff(values, 2)).max() for values in fitted]
-    assert roughness[2] < 1e-3 < roughness[1] < 0.7 * roughness[0]
-    assert max(tied.errors / np.exp(fitted[1])) < max(alone.errors / np.exp(fitted[0]))
 
 
 def test_shared_channels_are_smooth_once_in_a_joint_fit() -> None:

@@ -16,7 +16,6 @@ from fits.problem.noise import (
     information_weights,
     log_density,
     named_residual,
-    sigma_residual,
     tail_residual,
 )
 from fits.problem.parameters import Free, LogNormal, LogUniform, Normal
@@ -46,15 +45,6 @@ def test_densities_are_scipys_and_half_squares_of_residuals(z: float) -> None:
     assert np.sign(residual) == np.sign(z)
     assert 0.5 * residual**2 == pytest.approx(2.5 * np.log1p(z**2 / 4), rel=1e-12)
     assert float(tail_residual(jnp.asarray(z), "gaussian", NU)) == z
-
-
-def test_residuals_are_smooth() -> None:
-    slope = jax.grad(lambda z: tail_residual(z, "student", NU))
-    np.testing.assert_allclose([float(slope(z)) for z in (-1e-2, -1e-8, 0.0, 1e-8)], np.sqrt(5 / 4), rtol=1e-4)
-    levels = np.array([0.1, 0.2, 5.0])  # that of a level of noise is its logarithm
-    halves = 0.5 * np.asarray(sigma_residual(jnp.asarray(levels), jnp.asarray(0.1))) ** 2
-    np.testing.assert_allclose(halves - halves[0], np.log(levels / 0.1), rtol=1e-12)
-    assert np.isfinite(float(jax.grad(sigma_residual)(0.1, 0.1)))
 
 
 @pytest.mark.parametrize("tails", TAILS)
@@ -168,7 +158,6 @@ class Module(eqx.Module):
 
 
 CALLABLES = {
-    "function": (lambert, 1.0),
     "lambda": (lambda stack, wi, wo: lambert(stack, wi, wo, 2.0), 2.0),
     "compiled": (jax.jit(lambert), 1.0),
     "partial": (partial(lambert, gain=0.5), 0.5),
@@ -182,7 +171,6 @@ CALLABLES = {
 def test_any_callable_stands_for_a_transport(transport, gain: float) -> None:
     problem = Problem(PAINT, DATA, transport=transport)
     np.testing.assert_allclose(problem.predict([0.3]), np.full((3, 1), gain * 0.3 / np.pi), rtol=1e-12)
-    assert np.isfinite(problem.log_likelihood([0.3]))
     seen = simulate(lj.Stack([], lj.Lambertian(0.3)), slices(incidence=[20], outgoing=[10]), transport=transport)
     np.testing.assert_allclose(seen.values, [[gain * 0.3 / np.pi]], rtol=1e-12)
 
@@ -211,10 +199,10 @@ LINE_DATA = measured(VALUES)
         (lambda: Noise(relative=-0.1), "Noise.relative is -0.1"),
         (lambda: Noise(floor=Free(0.1, 0.0, 1.0)), r"Noise.floor.low is 0.0; it must be a number in \[1e-100, "),
         (lambda: Noise(relative=Free([0.1, 0.1], 0.0, 1.0)), "Noise.relative has 2 channels"),
-        (lambda: Noise(tails="cauchy"), "Noise.tails: 'cauchy' is not one of 'gaussian', 'student'"),
         (lambda: Noise(floor=1e-200), r"Noise.floor is 1e-200; it must be a number in \[1e-100, 1e\+100\]"),
         (lambda: Noise(relative=Free(0.5, 0.0, 5.0)), r"Noise.relative.high is 5.0; it must be a number in \[0, 1\]"),
         (lambda: Noise(degrees_of_freedom=0.0), "Noise.degrees_of_freedom is 0.0"),
+        (lambda: Noise(tails="cauchy"), "Noise.tails: 'cauchy' is not one of 'gaussian', 'student'"),
         (lambda: Problem({"a": 0.1, "b": 0.2}, LINE_DATA, line), "nothing is free"),
         (lambda: Problem(STACK, measured(VALUES, mask=np.zeros(COUNT, bool)), line), "no sample is used"),
         (lambda: Problem(STACK, LINE_DATA, line, Noise(relative=0.0, floor=0.0)), "sigma could become 0"),
@@ -224,15 +212,18 @@ LINE_DATA = measured(VALUES)
         ),
         (lambda: Problem(STACK, LINE_DATA, line, objective="l1"), "objective: 'l1' is not one of 'likelihood', "),
         (lambda: Problem(STACK, LINE_DATA, line, scale=-1.0), "scale is -1.0"),
-        (lambda: Problem(STACK, LINE_DATA, line, objective="cube_root"), "the prior Normal.* has no weight beside"),
-        (lambda: Problem(WALK, TWO, objective="cosine_l2"), r"Free.random_walk_sd 0.1 has no weight beside objective"),
+        (
+            lambda: Problem(STACK, LINE_DATA, line, objective="cube_root"),
+            r"the prior of \['b'\]: objective 'cube_root' weighs neither",
+        ),
+        (lambda: Problem(WALK, TWO, objective="cosine_l2"), "the prior of base.albedo: objective 'cosine_l2' weighs"),
         (
             lambda: Problem(FLAT, LINE_DATA, line, Noise(relative=Free(0.1, 0.0, 1.0)), objective="cosine_l2"),
-            r"noise\.relative: objective 'cosine_l2' has no noise model",
+            r"noise\.relative: objective 'cosine_l2' weighs neither",
         ),
         (
             lambda: Problem(FLAT, LINE_DATA, line, Noise(discrepancy=True), objective="cube_root"),
-            r"noise\.discrepancy: objective 'cube_root' has no noise model",
+            r"noise\.discrepancy: objective 'cube_root' weighs neither",
         ),
         (lambda: Problem(WALK, replace(TWO, values=TWO.values[:, :1], channels=("a",))), "it has 2 channels, the data"),
         (lambda: Problem(PAINT, DATA, transport=lj.Statistical), r'is not a Transport or "auto"'),

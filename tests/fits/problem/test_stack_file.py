@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 
 import layerjax as lj
+from fits.optimise.options import FitOptions, options_from
 from fits.problem.discrepancy import Discrepancy
 from fits.problem.instrument import Instrument
 from fits.problem.noise import Noise
 from fits.problem.parameters import Box, Free, LogNormal, LogUniform, Normal, PowerLaw, is_free
-from fits.problem.stack_file import read_instrument, read_problem, stack_from_dict, stack_to_dict, write_problem
+from fits.problem.stack_file import material_to_dict, read_instrument, read_problem, stack_from_dict, write_problem
 from tests.helpers import places
 
 EXAMPLES = sorted(places.EXAMPLES.glob("*.toml"))
@@ -48,6 +49,8 @@ prior = { kind = "LogNormal", median = 1.0, sd = 0.05 }
 [instrument]
 detector_aperture = 2.0
 tilt = { start = 0.0, low = -1.0, high = 1.0 }
+[options]
+autocorrelation = 0.4
 """
 INSTRUMENT = Instrument(detector_aperture=2.0, tilt=Free(0.0, -1.0, 1.0))
 BASE = 'base = { kind = "Lambertian", albedo = 0.5 }\n'
@@ -82,6 +85,7 @@ def test_everything_in_a_file_arrives_and_is_written_again(tmp_path):
     assert (problem.objective, problem.instrument) == ("cube_root", INSTRUMENT)
     assert problem.about == {"source": "a paper", "remark": "kept as it is"}
     assert problem.text == FULL
+    assert options_from(problem.options) == FitOptions(autocorrelation=0.4)
 
     path = tmp_path / "again.toml"
     names = ("transport", "noise", "scale", "objective", "instrument")
@@ -104,24 +108,13 @@ def test_everything_in_a_file_arrives_and_is_written_again(tmp_path):
         assert read_problem(path).noise == Noise(0.03, discrepancy=given)
 
 
-# of one's own: a file could name them, but nothing could read them back
-Ghost, Painted, Careful = (
-    type(name, (kind,), {})
-    for name, kind in (("Ghost", lj.Rayleigh), ("Painted", lj.Lambertian), ("Careful", lj.SingleScattering))
-)
-
-
-@pytest.mark.parametrize(
-    ("stack", "transport", "message"),
-    [
-        (lj.Stack([lj.Interface(1.5, 0.1), lj.Medium(1.0, phase=Ghost())]), "auto", r"layers\[1\]\.phase\.kind is 'Gh"),
-        (lj.Stack([], Painted(0.5)), "auto", r"base\.kind is 'Painted', must be one of Lambertian, "),
-        (lj.Stack([], lj.Lambertian(0.5)), Careful(), r"transport is 'Careful', must be one of "),
-    ],
-)
-def test_what_could_not_be_read_back_is_not_written(tmp_path, stack, transport, message):
-    with pytest.raises(ValueError, match=message):
-        write_problem(tmp_path / "problem.toml", stack, transport=transport)
+def test_what_could_not_be_read_back_is_not_written(tmp_path):
+    """Classes of one's own: a file could name them, but nothing could read them back."""
+    painted, careful = type("Painted", (lj.Lambertian,), {}), type("Careful", (lj.SingleScattering,), {})
+    with pytest.raises(ValueError, match=r"base\.kind is 'Painted', must be one of Lambertian, "):
+        write_problem(tmp_path / "problem.toml", lj.Stack([], painted(0.5)))
+    with pytest.raises(ValueError, match=r"transport is 'Careful', must be one of "):
+        write_problem(tmp_path / "problem.toml", lj.Stack([], lj.Lambertian(0.5)), transport=careful())
     assert not list(tmp_path.iterdir())
 
 
@@ -137,48 +130,36 @@ def test_dictionary_round_trip():
         lj.Stack([lj.Medium(Free(1.0, 0.1, 10.0, LogUniform()), phase=lj.Rayleigh())], lj.OrenNayar(0.5, 0.3)),
         lj.Stack([lj.TurbidMedium(0.2, LAW, 0.5, lj.HenyeyGreenstein(0.3))]),
     ):
-        assert_same(stack_from_dict(stack_to_dict(stack)), stack)
+        assert_same(stack_from_dict(material_to_dict(stack)), stack)
     stack = jax.tree.map(lambda leaf: leaf.astype("float32"), lj.Stack([], base=lj.Lambertian(albedo=np.float32(0.9))))
-    assert stack_to_dict(stack) == {"base": {"kind": "Lambertian", "albedo": 0.9}}
+    assert material_to_dict(stack) == {"base": {"kind": "Lambertian", "albedo": 0.9}}
 
 
 FREE = LAYER + "thickness = {{ start = 1, low = 0, high = 2{} }}\n"
-PHASE = LAYER + "thickness = 1\nphase = {{ kind = 'SGGX', {} }}\n"
 WRONG = {
     "": "neither a layer nor a base",
     LAYER + "thickness = 1\nalbdo = 0.5\n": r"layers\[0\] has an unknown key 'albdo' \(did you mean 'albedo'\?\); allo",
-    BASE + "about = { year = 2022 }\n": r"about\['year'\] is 2022, must be a text",
     BASE + "bse = 3\n": "the file has an unknown key 'bse'",
-    LAYER + "thickness = -1\n": r"layers\[0\].thickness is -1, must be a number in \[0, 10000\]",
-    LAYER + "albedo = 0.5\n": r"layers\[0\] \(Medium\) has no thickness",
+    LAYER + "thickness = -1\n": r"layers\[0\]: Medium.thickness: -1 is outside \[0, 10000\]",
+    LAYER + "albedo = 0.5\n": r"layers\[0\] has no thickness, which Medium needs",
     "[[layers]]\nthickness = 1\n": r"layers\[0\] has no kind, must be one of Interface, Medium",
     "[[layers]]\nkind = 'Mediun'\n": r"layers\[0\].kind is 'Mediun' \(did you mean 'Medium'\?\)",
-    FREE.replace("start = 1", "start = 9").format(
-        ""
-    ): r"layers\[0\].thickness: start is 9.0; it must lie in \[0.0, 2.0\]",
-    FREE.replace("low = 0", "low = 5").format(""): r"layers\[0\].thickness: low is 5.0 and high is 2.0",
-    FREE.replace(", high = 2", "").format(""): r"layers\[0\].thickness has no high",
-    FREE.replace("high = 2", "high = 1e6").format(""): r"layers\[0\].thickness.high is 1e\+06, must be",
     FREE.format(", hihg = 2"): r"layers\[0\].thickness has an unknown key 'hihg'",
+    FREE.replace("low = 0", "low = 5").format(""): r"layers\[0\].thickness: low is 5.0 and high is 2.0",
+    FREE.replace(", high = 2", "").format(""): r"layers\[0\].thickness has no high, which Free needs",
+    FREE.replace("high = 2", "high = 1e6").format(""): r"layers\[0\].thickness.high is 1000000.0, must be a number in",
     FREE.format(", prior = { kind = 'Normal', mean = 1, sd = -1 }"): r"layers\[0\].thickness.prior: Normal.sd is -1",
-    FREE.format(", prior = { kind = 'LogUniform' }"): r"layers\[0\].thickness: low is 0.0; it must be above 0",
-    PHASE.format("shape = 'ball', alpha = 0.1"): r"layers\[0\].phase.shape is 'ball', must be one of surface, fiber",
-    PHASE.format("shape = 'fiber', alpha = 0.1, axis = [1, 0]"): r"layers\[0\].phase: SGGX.axis: shape \(2,\)",
-    BASE + "noise = { relative = -1 }\n": "noise.relative is -1",
+    LAYER
+    + "thickness = 1\nphase = { kind = 'SGGX', shape = 'ball', alpha = 0.1 }\n": r"layers\[0\].phase: SGGX.shape: ",
     BASE + "noise = { discrepancy = { length_half = -3.0 } }\n": "noise.discrepancy.length_half is -3.0",
-    BASE + "noise = { discrepancy = { length_half = { low = 5.0 } } }\n": "noise.discrepancy.length_half has no start",
-    BASE + "scale = { start = 1, low = -1, high = 2 }\n": r"scale.low is -1, must be a number in \[1e-100, 1e\+100\]",
     BASE + "scale = { start = [1, 1], low = 0.5, high = 2 }\n": "scale has 2 channels, must be one number for all",
-    BASE + "instrument = { detector_aperture = 31 }\n": r"instrument.detector_aperture is 31.0; .* in \[0, 30\]",
-    BASE + "instrument = { rings = 0 }\n": "instrument.rings: 0 is not a whole number from 1 to 8",
-    BASE + "instrument = { aperture = 1 }\n": "instrument has an unknown key 'aperture'",
-    BASE + "transport = 'Singlescattering'\n": "transport is 'Singlescattering' .did you mean 'SingleScattering'",
+    BASE + "instrument = { detector_aperture = 31 }\n": r"instrument.detector_aperture is 31; .* in \[0, 30\]",
     BASE
-    + "transport = { kind = 'AddingDoubling', ordinates = [8, 12.5] }\n": r"ordinates is \[8, 12.5\], must be a list",
+    + "instrument = { floor = { start = 1, low = 0, high = 2 } }\n": "instrument.floor.low is 0.0; .* in .1e-100, ",
+    BASE + "transport = 'Singlescattering'\n": "transport is 'Singlescattering' .did you mean 'SingleScattering'",
     "[base]\nkind = 'Lambertian'\nalbedo = [0.1, 0.2]\n"
     + LAYER
     + "thickness = [1, 2, 3]\n": "disagree on the number of",
-    "[[layers]]\nkind = 'Interface'\nior = 1.5\nalpha = [0.1, 0.2]\n": r"Interface.alpha: \(0.1, 0.2\) given",
 }
 
 
@@ -195,8 +176,6 @@ def test_bad_files_are_one_line_that_names_the_place(tmp_path, text):
     [
         (b"\xef\xbb\xbf", "there is neither a layer nor a base"),
         (BASE.encode("utf-16"), "not a text file (byte 0 is not UTF-8)"),
-        (bytes(range(128, 256)), "not a text file"),
-        (BASE.encode() + b"\0", "not valid TOML: "),
         (b"base." + b"a." * 2000 + b"b = 1\n", "base has no kind"),
         (b"about = { day = 2020-13-01 }\n", "not valid TOML: "),
     ],
@@ -224,123 +203,70 @@ def test_examples_are_valid(path):
 
 MEDIUM = 'layers = [{ kind = "Medium", thickness = 1.0, %s }]\n'
 NUMBER = 'layers = [{ kind = "Medium", thickness = { start = 1.0, low = 0.5, high = 2.0%s } }]\n'
-SCALE = BASE + "scale = { start = 1.0, low = 0.5, high = 2.0%s }\n"
 # where @ stands, any value may be written; the keys are what an error must name
 PLACES = {
     "layers": "layers = @\n",
-    "layers[0]": "layers = [@]\n",
     "layers[0].kind": "layers = [{ kind = @ }]\n",
     "layers[0].thickness": 'layers = [{ kind = "Medium", thickness = @ }]\n',
     "layers[0].phase": MEDIUM % "phase = @",
-    "layers[0].phase.g": MEDIUM % 'phase = { kind = "HenyeyGreenstein", g = @ }',
     "layers[0].phase.shape": MEDIUM % 'phase = { kind = "SGGX", shape = @, alpha = 0.5 }',
-    "axis": MEDIUM % 'phase = { kind = "SGGX", shape = "fiber", alpha = 0.5, axis = @ }',
-    "layers[0].phase.axis": MEDIUM % 'phase = { kind = "SGGX", shape = "fiber", alpha = 0.5, axis = [0, 0, @] }',
     "layers[0].distribution": 'layers = [{ kind = "Interface", ior = 1.5, alpha = 0.1, distribution = @ }]\n',
-    "layers[0].thickness.start": NUMBER.replace("1.0", "@") % "",
     "layers[0].thickness.low": NUMBER.replace("0.5", "@") % "",
-    "layers[0].thickness.high": NUMBER.replace("2.0", "@") % "",
     "layers[0].thickness.prior": NUMBER % ", prior = @",
-    "layers[0].thickness.prior.mean": NUMBER % ', prior = { kind = "Normal", mean = @, sd = 0.1 }',
-    "layers[0].thickness.prior.sd": NUMBER % ', prior = { kind = "Normal", mean = 1.0, sd = @ }',
     "layers[0].thickness.prior.median": NUMBER % ', prior = { kind = "LogNormal", median = @, sd = 0.1 }',
-    "base": "base = @\n",
-    "base.k": 'base = { kind = "Conductor", ior = 1.0, k = @, alpha = 0.1 }\n',
     "gallery": "gallery = @\n",
     "objective": BASE + "objective = @\n",
     "transport": BASE + "transport = @\n",
-    "transport.nodes": BASE + 'transport = { kind = "AddingDoubling", nodes = @ }\n',
     "transport.ordinates[1]": BASE + 'transport = { kind = "AddingDoubling", ordinates = [8, @] }\n',
-    "transport.tolerance": BASE + 'transport = { kind = "AddingDoubling", tolerance = @ }\n',
-    "transport.symmetric": BASE + 'transport = { kind = "Statistical", symmetric = @ }\n',
     "noise": BASE + "noise = @\n",
     "noise.relative": BASE + "noise = { relative = @ }\n",
-    "floor": BASE + "noise = { floor = { start = 0.1, low = @, high = 0.2 } }\n",
     "noise.use_sigma": BASE + "noise = { use_sigma = @ }\n",
-    "degrees_of_freedom": BASE + "noise = { degrees_of_freedom = @ }\n",
-    "scale": BASE + "scale = @\n",
-    "scale.low": SCALE.replace("low = 0.5", "low = @") % "",
-    "scale.prior.sd": SCALE % ', prior = { kind = "LogNormal", median = 1.0, sd = @ }',
-    "about.source": BASE + "about = { source = @ }\n",
+    "scale.low": BASE + "scale = { start = 1.0, low = @, high = 2.0 }\n",
     "mystery": BASE + "mystery = @\n",
 }
 VALUES = {
     "309 digits": "9" * 309,
-    "64 bits": str(2**63),
     "infinity": "inf",
     "not a number": "nan",
-    "1e308": "1e308",
     "-1e308": "-1e308",
     "1e-310": "1e-310",
-    "-0.0": "-0.0",
     "true": "true",
     "moment": "2020-02-29T12:00:00.123456Z",
-    "empty text": "''",
     "long text": '"' + "long " * 20_000 + '"',
     "lines": r'"first\nsecond\u0000third"',
     "empty list": "[]",
-    "empty table": "{}",
     "list of lists": "[[0.5]]",
     "long list of texts": "[" + "'half', " * 2000 + "]",
     "arrays 20000 deep": "[" * 20_000 + "]" * 20_000,
     "tables 300 deep": "{ a = " * 300 + "1" + " }" * 300,
-    "long key": "{ " + "a" * 20_000 + " = 1 }",
 }
-
-
-def refused(path: Path) -> str | None:
-    """The error of reading a file, less the file's name, which it must begin with; None if the file can be used."""
-    try:
-        problem = read_problem(path)
-    except ValueError as error:
-        message = str(error)
-        assert message.startswith(f"{path}: "), message[:200]
-        assert message.isprintable(), message
-        assert len(message) < len(str(path)) + 700, message
-        return message.removeprefix(f"{path}: ")
-    # it can be used: bounds and priors are numbers, and it is written again
-    parts = (problem.stack, problem.scale, problem.noise.relative, problem.noise.floor)
-    box = Box.of([leaf for leaf in jax.tree.leaves(parts, is_leaf=is_free) if is_free(leaf)])
-    for s in np.linspace(0.0, 1.0, 5)[:, None] * np.ones(len(box.low)):
-        vector = box.from_unit(s)
-        for found in (vector, box.prior_residuals(vector) ** 2, box.log_prior(np.clip(vector, box.low, box.high))):
-            assert np.isfinite(found).all()
-    given = {name: getattr(problem, name) for name in ("transport", "noise", "scale", "objective")}
-    write_problem(again := path.with_name("again.toml"), problem.stack, force=True, **given)
-    assert read_problem(again).noise == problem.noise
-    return None
 
 
 @pytest.mark.parametrize("name", VALUES)
 def test_any_value_in_any_place(tmp_path: Path, name: str) -> None:
+    """It can be computed with, or one line says where it is."""
     path = tmp_path / "stack.toml"
     for place, text in PLACES.items():
         path.write_text(text.replace("@", VALUES[name]))
-        message = refused(path)
-        unread = message is not None and message.startswith(("arrays or tables are nested", "not valid TOML"))
-        assert unread == ("20000 deep" in name), message
-        if message is not None and not unread:
-            assert place.partition(".")[0].partition("[")[0] in message, (place, message)
-            assert place.rpartition(".")[2].partition("[")[0] in message or "channels" in message, (place, message)
-
-
-@pytest.mark.parametrize(
-    ("prior", "words"),
-    [
-        ('"Normal", mean = 1e300, sd = 1e-300', "its centre must lie within 37 standard deviations of [0.1, 0.9]"),
-        ('"Normal", mean = 5.0, sd = 0.1', "its centre must lie within 37 standard deviations"),
-        ('"Normal", mean = 0.5, sd = 1e-300', "its sd must be above 1e-15 of the distance"),
-        ('"Normal", mean = 0.5, sd = 1e-310', "its sd must be above 1e-15 of the distance"),
-        ('"LogNormal", median = 1e300, sd = 1.0', "its centre must lie within 37 standard deviations"),
-        ('"LogNormal", median = 0.5, sd = 1e-300', "its sd must be above 1e-15 of the distance"),
-        ('"Normal", mean = 1e400, sd = 1.0', "prior.mean is inf, must be a finite number"),
-    ],
-)
-def test_priors_that_cannot_be_computed_with_are_refused(tmp_path: Path, prior: str, words: str) -> None:
-    path = tmp_path / "stack.toml"
-    free = "{ start = 0.5, low = 0.1, high = 0.9, prior = { kind = %s } }" % prior  # noqa: UP031
-    path.write_text(f'base = {{ kind = "Lambertian", albedo = {free} }}\n')
-    message = refused(path)
-    assert message is not None
-    assert message.startswith("base.albedo")
-    assert words in message
+        try:
+            problem = read_problem(path)
+        except ValueError as error:
+            message = str(error)
+            assert message.startswith(f"{path}: "), message[:200]
+            assert message.isprintable(), message
+            assert len(message) < len(str(path)) + 700, message
+            message = message.removeprefix(f"{path}: ")
+            unread = message.startswith(("arrays or tables are nested", "not valid TOML"))
+            assert unread == ("20000 deep" in name), message
+            first, last = place.split(".")[0].split("[")[0], place.split(".")[-1].split("[")[0]
+            assert unread or (first in message and (last in message or "channels" in message)), (place, message)
+            continue
+        parts = (problem.stack, problem.scale, problem.noise.relative, problem.noise.floor)
+        box = Box.of([leaf for leaf in jax.tree.leaves(parts, is_leaf=is_free) if is_free(leaf)])
+        for s in np.linspace(0.0, 1.0, 5)[:, None] * np.ones(len(box.low)):
+            vector = box.from_unit(s)
+            for found in (vector, box.prior_residuals(vector) ** 2, box.log_prior(np.clip(vector, box.low, box.high))):
+                assert np.isfinite(found).all()
+        given = {name: getattr(problem, name) for name in ("transport", "noise", "scale", "objective")}
+        write_problem(again := path.with_name("again.toml"), problem.stack, force=True, **given)
+        assert read_problem(again).noise == problem.noise

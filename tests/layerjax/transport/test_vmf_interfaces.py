@@ -7,7 +7,7 @@ import pytest
 
 import fits
 import layerjax as lj
-from fits.problem.stack_file import stack_from_dict, stack_to_dict
+from fits.problem.stack_file import material_to_dict, stack_from_dict
 from layerjax.directions import split
 from layerjax.surfaces.interface import interface_pdf, interface_reflection, interface_sample, interface_transmission
 from layerjax.transport.automatic import automatic
@@ -214,7 +214,7 @@ def test_automatic_takes_a_transport_that_carries_them():
 
 def test_files_say_which():
     stack = lj.Stack([face(1.5, 50.0), lj.Interface(1.2, 0.3)], metal(1e-2))
-    tables = stack_to_dict(stack)
+    tables = material_to_dict(stack)
     assert [layer["distribution"] for layer in tables["layers"]] == ["vmf", "ggx"]
     back = stack_from_dict(tables)
     assert back.layers[0].distribution == back.base.distribution == "vmf"
@@ -222,7 +222,7 @@ def test_files_say_which():
     free = {"start": 2.0, "low": 0.1, "high": 14.0}
     layer = {"kind": "Interface", "ior": 1.5, "alpha": free, "distribution": "vmf"}
     assert stack_from_dict({"layers": [layer]}).layers[0].alpha == fits.Free(2.0, 0.1, 14.0)
-    with pytest.raises(ValueError, match=r"layers\[0\]\.alpha\.start is 2, must be a number in \[0\.0001, 1\]"):
+    with pytest.raises(ValueError, match=r"layers\[0\]\.alpha\.start is 2.0, must be a number in \[0\.0001, 1\]"):
         stack_from_dict({"layers": [layer | {"distribution": "ggx"}]})
 
 
