@@ -78,15 +78,6 @@ def write_bytes(path: str | Path, content: bytes, force: bool = False, durable: 
             raise
 
 
-def write_together(folder: Path, contents: Mapping[str, bytes]) -> None:
-    """Write several files of a folder and replace existing ones: if one cannot be written, none is."""
-    with named(folder), tempfile.TemporaryDirectory(prefix=".", suffix=".new", dir=folder) as new:
-        for name, content in contents.items():
-            write_bytes(Path(new) / name, content)
-        for name in contents:
-            os.replace(Path(new) / name, folder / name)
-
-
 def write_json(path: Path, content: Mapping[str, Any], force: bool = False) -> None:
     """Write a JSON file that holds a checksum of itself; numbers that are not finite become "nan", "inf", "-inf"."""
     written = plain(content)

@@ -8,7 +8,7 @@ from fits.data.measurements import TO_HAVE_THEM, Measurements
 from fits.maps.report import report as report_map
 from fits.maps.store import FittedMap
 from fits.optimise.result import Fit
-from fits.reports import html
+from fits.reports.html import FitReport
 from fits.reports.verdicts import DEFAULT, ReportOptions
 from fits.sampling.posterior import Posterior
 from layerjax._checks import require_kind
@@ -55,5 +55,4 @@ def report(
         report_map(fit, path, force)
         return
     fit.require_one("report")
-    whole = html.FitReport(fit, posterior, others or {}, name, held_out, options)
-    write_text(path, whole.page(), force=force)
+    write_text(path, FitReport(fit, posterior, others or {}, name, held_out, options).page(), force=force)

@@ -419,7 +419,7 @@ def overview(rows: Sequence[Row], most: int) -> tables.Table:
     # all of the status is in the table and in the report of the fit
     shown = [tuple("; ".join(_cell(row.get(name, ""), 4).split("; ")[:2]) for name in columns) for row in rows]
     note = "Standing: among the stacks of a file, by -2 log predictive density of held-out data, or else AIC."
-    return tables.Table("Fits", tuple(columns), tables.shortened(shown, most), note, keys=2)
+    return tables.Table("Fits", tuple(columns), tables.shortened(shown, most), note)
 
 
 def statements(result: FittedFiles) -> list[str]:

@@ -15,7 +15,7 @@ from benchmarks.measuring import environment
 from benchmarks.measuring.writing import DIRECTORY, environment_lines, rounded, table, write
 from fits.data.measurements import Measurements
 from fits.data.reading import read
-from fits.data.selection import Rows, select
+from fits.data.scans import Rows, select
 from fits.problem.stack_file import read_problem
 
 NAME = "held-out"

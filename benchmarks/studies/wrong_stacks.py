@@ -16,7 +16,7 @@ from benchmarks.measuring.writing import DIRECTORY, environment_lines, rounded, 
 from benchmarks.studies.calibration.run import drawn
 from benchmarks.suite import coated_haze
 from fits.data.measurements import Measurements
-from fits.data.selection import Rows, select
+from fits.data.scans import Rows, select
 
 NAME = "wrong-stacks"
 REPEATS, QUICK = 100, 10

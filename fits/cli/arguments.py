@@ -14,9 +14,8 @@ from fits.names import EXPORTS
 
 def _number(kind: type[int] | type[float], low: float, high: float = math.inf) -> Callable[[str], Any]:
     """What reads a number of this kind and range."""
-    allowed = f"{'a whole number' if kind is int else 'a number'} " + (
-        f">= {low:g}" if high == math.inf else f"in [{low:g}, {high:g}]"
-    )
+    span = f">= {low:g}" if high == math.inf else f"in [{low:g}, {high:g}]"
+    allowed = f"{'a whole number' if kind is int else 'a number'} {span}"
 
     def read(word: str) -> Any:
         try:
@@ -30,24 +29,14 @@ def _number(kind: type[int] | type[float], low: float, high: float = math.inf) -
     return read
 
 
-count, level, polar = _number(int, 1), _number(float, 0.0), _number(float, 0.0, 180.0)
+count, level, share = _number(int, 1), _number(float, 0.0), _number(float, 0.0, 1.0)
+angle, polar = _number(float, 0.0, 90.0), _number(float, 0.0, 180.0)
 
 
 def degrees(words: str) -> list[float]:
     """Polar angles, separated by commas."""
     return [polar(word) for word in words.split(",")]
 
-
-def scale(word: str) -> tuple[str, float]:
-    """A number, at least 0, and the name before it, as in base.albedo=0.1; "" where there is none."""
-    name, _, number = word.rpartition("=")
-    return name, level(number)
-
-
-DATA = "measurements: csv, MERL .binary, .bsdf and others, see docs/formats.md"
-RESULT = "result directory of `layerjax fit`"
-MATERIAL = f"{RESULT}, a stack (free parameters at their start), or a material of the gallery"
-SELECTIONS = "incidence=10,50; plane=0; angle=-60:60; share=0.2; channel=red"
 
 Settings = dict[str, Any]
 
@@ -69,31 +58,31 @@ def _out(metavar: str, what: str = "file to write", required: bool = True) -> Se
     return _one(what, metavar, required=required)
 
 
+DATA = _one("measurements: csv, MERL .binary, .bsdf and others, see docs/formats.md", "DATA")
+RESULT = _one("result directory of `layerjax fit`", "DIR")
+MATERIAL = _one("result directory, stack (free parameters at their start), or material of the gallery", "DIR|TOML|NAME")
+INCIDENCE = _several("polar angles of the light", "DEG", type=degrees)
+AZIMUTH = _several("planes; 0 is that of incidence (default)", "DEG", type=float)
+READ_HELP = (
+    "options of the reader: format=merl; quantity=brdf, brdf_cos or reflectance_factor; bins=5000 or all, strata=flux "
+    "(MERL, RGL); wavelengths=600,620 in nm, corrected=yes or no (.rxt); default: as the file says"
+)
+
 OPTIONS: dict[str, Settings] = {
     "--stack": _one("the stack, with its free parameters", "TOML", required=True),
     "--starts": _one("starting points (default: %(default)s)", "N", type=count, default=32),
     "--seed": _one("random seed (default: %(default)s)", "S", type=_number(int, 0, 2**32 - 1), default=0),
     "--force": _flag("overwrite the file"),
-    "--read": _several(
-        "options of the reader: format=merl; quantity=brdf, brdf_cos or reflectance_factor; bins=5000 or all, "
-        "strata=flux (MERL, RGL); wavelengths=600,620 in nm, corrected=yes or no (.rxt); default: as the file says",
-        "OPTION",
-    ),
-    "--min-retro-angle": _one("mask measurements closer to retro-reflection", "DEG", type=_number(float, 0.0, 90.0)),
-    "--max-polar-angle": _one("mask measurements farther from the normal", "DEG", type=_number(float, 0.0, 90.0)),
-    "--select": _several(f"use only these data: {SELECTIONS}", "DATA"),
-    "--hold-out": _several(
-        "hold these data out of the fit and score their prediction, such as incidence=30,70", "DATA"
-    ),
+    "--read": _several(READ_HELP, "OPTION"),
+    "--min-retro-angle": _one("mask measurements closer to retro-reflection", "DEG", type=angle),
+    "--max-polar-angle": _one("mask measurements farther from the normal", "DEG", type=angle),
+    "--select": _several("use only these data: incidence=10,50; azimuth=0; theta_o=20:60; channels=red", "DATA"),
+    "--hold-out": _several("hold these data out and score their prediction, such as incidence=30,70", "DATA"),
     "--library": _one("layers and bases to choose from (default: built in)", "TOML"),
-    "--noise": _one(
-        "relative noise beside the file's sigma (default: 0.05 without one)", "REL", type=_number(float, 0.0, 1.0)
-    ),
+    "--noise": _one("relative noise beside the file's sigma (default: 0.05 without one)", "REL", type=share),
     "--scale-sd": _one("relative standard deviation of the global scale (default: 0)", "SD", type=level),
     "--processes": _one("worker processes (default: threads of a single one)", "N", type=count, default=1),
-    "--scheduler": _one(
-        "in place of --processes: dask.distributed cluster that sees the files, such as tcp://...:8786", "ADDRESS"
-    ),
+    "--scheduler": _one("in place of --processes: dask.distributed cluster, such as tcp://...:8786", "ADDRESS"),
 }
 """Options of several commands; `COMMANDS` says what differs."""
 
@@ -109,13 +98,12 @@ class Command(NamedTuple):
 
 
 _READ = "--read --min-retro-angle --max-polar-angle"
-_INCIDENCE, _PLANES = "polar angles of the light", "planes; 0 is that of incidence (default)"
 
 COMMANDS = {
     "fit": Command(
         "fit a stack to measurements and write a result directory with a report",
         "layerjax fit slices.csv --stack coat.toml --out result --max-polar-angle 80 --hold-out incidence=30",
-        {"data": _one(DATA, "DATA"), "--out": _out("DIR", "result directory to write")},
+        {"data": DATA, "--out": _out("DIR", "result directory to write")},
         f"--stack --starts --seed {_READ} --select --hold-out --force",
         {"--force": {"help": "replace DIR if it holds an earlier result"}},
     ),
@@ -123,36 +111,20 @@ COMMANDS = {
         "fit a stack to every texel of a map and write a store with the parameters of each; resumes where it stopped",
         "layerjax fit-map coat.h5 --geometry view.csv --stack coat.toml --out coat.zarr --noise 0.02",
         {
-            "data": _one(
-                "BSDF (..., N, C) or (..., N) in 1/sr: .npy, HDF5 or zarr; file.h5:/name, store.zarr:/name of several",
-                "DATA",
-            ),
+            "data": _one("BSDF (..., N, C) or (..., N) in 1/sr: .npy, HDF5 or zarr (file.h5:/name of several)", "DATA"),
             "--out": _out("STORE", "store to write, or to resume; ends in .zarr"),
-            "--geometry": _one(
-                "directions of the measurements: csv, or a file with wi and wo, or theta_i, phi_i, theta_o, phi_o in "
-                "degrees (default: these stand beside DATA)",
-                "FILE",
-            ),
+            "--geometry": _one("directions: csv, or a file with wi and wo or angles (default: beside DATA)", "FILE"),
             "--sigma": _one("their standard deviations, (..., N, C), (..., N) or (N)", "FILE"),
             "--mask": _one("which texels are fitted, (...): 1, or 0 for those skipped", "FILE"),
             "--pilot-texels": _one("fitted first, from many starts (default: 64)", "N", type=count, default=64),
             "--chunk-size": _one("texels a task (default: 1024)", "N", type=count, default=1024),
             "--emulator": _one(
-                "Chebyshev series over the bounds in place of the transport (default: where they are exact enough)",
-                choices=("auto", "always", "never"),
-                default="auto",
+                "series over the bounds in place of the transport", choices=("auto", "always", "never"), default="auto"
             ),
             "--spatial-prior": _one(
-                "beside the plain fit, a prior of neighbouring texels; gaussian: changes are gradual; "
-                "total_variation: areas are even, edges stay (default: none)",
-                choices=("gaussian", "total_variation"),
+                "of neighbouring texels: gradual, or even", choices=("gaussian", "total_variation")
             ),
-            "--spatial-scale": _several(
-                "of the difference between neighbours, as a share of the bounds, of all parameters or of NAME",
-                "[NAME=]X",
-                type=scale,
-            ),
-            "--spatial-rounds": _one("of that prior, at most (default: 10)", "N", type=count, default=10),
+            "--spatial-scale": _one("of the difference between neighbours, as a share of the bounds", "X", type=level),
         },
         "--stack --noise --starts --seed --processes --scheduler --force",
         {
@@ -165,7 +137,7 @@ COMMANDS = {
         "sample the posterior of a fit; run again, it resumes the chain",
         "layerjax sample result --ess 2000",
         {
-            "directory": _one(RESULT, "DIR"),
+            "directory": RESULT,
             "--sampler": _one("nuts: for many parameters (default: the chain's, or emcee)", choices=("emcee", "nuts")),
             "--walkers": _one("even number (default: the chain's, or 32; 4 chains of nuts)", "N", type=count),
             "--ess": _one("effective sample size of every parameter (default: 1000)", "N", type=count),
@@ -179,19 +151,19 @@ COMMANDS = {
         "predict the BSDF and new measurements at other directions, or score the prediction of measurements",
         "layerjax predict result --incidence 30,70 --out predicted.csv",
         {
-            "directory": _one(RESULT, "DIR"),
-            "--incidence": _several(_INCIDENCE, "DEG", type=degrees),
-            "--azimuth": _several(_PLANES, "DEG", type=float),
+            "directory": RESULT,
+            "--incidence": INCIDENCE,
+            "--azimuth": AZIMUTH,
             "--score": _one("in place of --incidence: measurements to predict and score", "FILE"),
             "--out": _out("CSV", "file to write; its name ends in .csv", required=False),
         },
         "--read --select --force",
     ),
     "report": Command(
-        "write the report and the pictures of a result directory again, or the report of a fitted map",
+        "write the report of a result directory again, or that of a fitted map",
         "layerjax report result --compare other_result",
         {
-            "directory": _one(f"{RESULT}, or store of `layerjax fit-map`", "DIR"),
+            "directory": RESULT | {"help": "result directory of `layerjax fit`, or store of `layerjax fit-map`"},
             "--compare": _several("results to compare on the same data", "DIR2"),
             "--out": _out("HTML", "file to write (default: in DIR, or beside the store of a map)", required=False),
         },
@@ -200,19 +172,18 @@ COMMANDS = {
     ),
     "compare": Command(
         "compare fits of the same data by out-of-sample prediction",
-        "layerjax compare coated bare --out comparison.html",
+        "layerjax compare coated bare",
         {
             "directories": _several("two or more result directories", "DIR"),
-            "--out": _out("HTML", "write the comparison with its pictures to this file", required=False),
             "--no-refit": _flag("rank by AIC, without cross-validation"),
         },
-        "--force",
+        "",
     ),
     "search": Command(
         "search for the stack behind data: stacks grow layer by layer and are ranked by out-of-sample prediction",
         "layerjax search slices.csv --out stacks --noise 0.03 --scale-sd 0.1",
         {
-            "data": _one(DATA, "DATA"),
+            "data": DATA,
             "--out": _out("DIR", "directory to write, or to resume"),
             "--layers": _one("most layers over the base (default: 3)", "N", type=int, default=3),
             "--instrument": _one("a file with an [instrument], such as a stack file", "TOML"),
@@ -233,16 +204,13 @@ COMMANDS = {
     "info": Command(
         "say what is in a measurement file, and draw it",
         "layerjax info slices.csv",
-        {
-            "data": _one(DATA, "FILE"),
-            "--out": _out("PNG", "picture (default: FILE's name as .png, in the current directory)", required=False),
-        },
+        {"data": DATA, "--out": _out("PNG", "picture (default: the file's name as .png, here)", required=False)},
         "--read --force",
     ),
     "convert": Command(
         "write measurements as csv in this project's convention",
         "layerjax convert AnoBlackNiTEonSteel.bsdf steel.csv",
-        {"data": _one(DATA, "IN"), "out": _one("file to write; its name ends in .csv", "OUT")},
+        {"data": DATA, "out": _one("file to write; its name ends in .csv", "OUT")},
         "--read --force",
     ),
     "simulate": Command(
@@ -250,8 +218,8 @@ COMMANDS = {
         "layerjax simulate --stack coat.toml --incidence 10,30,50,70 --noise 0.05 --out simulated.csv",
         {
             "--out": _out("CSV", "file to write; its name ends in .csv"),
-            "--incidence": _several(_INCIDENCE, "DEG", type=degrees, default=([10, 30, 50, 70],)),
-            "--azimuth": _several(_PLANES, "DEG", type=float, default=(0,)),
+            "--incidence": INCIDENCE | {"default": ([10, 30, 50, 70],)},
+            "--azimuth": AZIMUTH | {"default": (0,)},
         },
         "--stack --noise --seed --force",
         {
@@ -260,27 +228,20 @@ COMMANDS = {
         },
     ),
     "render": Command(
-        "draw a material: spheres, lobes and a map of its BSDF",
+        "draw a material: spheres and lobes",
         "layerjax render window_shade --out window_shade.png",
-        {
-            "material": _one(MATERIAL, "DIR|TOML|NAME"),
-            "--out": _out("PNG", "file to write; its name ends in .png"),
-            "--size": _one("pixels a sphere (default: %(default)s)", "N", type=count, default=256),
-        },
+        {"material": MATERIAL, "--out": _out("PNG", "file to write; its name ends in .png")},
         "--force",
     ),
     "export": Command(
         "write a material for renderers (Mitsuba, pbrt, MaterialX) or for optical design (Zemax, LightTools)",
         "layerjax export result --to rgl --out coat.bsdf",
         {
-            "material": _one(MATERIAL, "DIR|TOML|NAME"),
+            "material": MATERIAL,
             "--to": _one("rgl: Mitsuba's and pbrt's tensor file; openpbr: MaterialX", choices=EXPORTS, required=True),
             "--out": _out("FILE"),
             "--wavelengths": _several(
-                "wavelengths of the channels, for a spectral rgl file",
-                "NM",
-                type=_number(float, 1.0, 1e9),
-                default=None,
+                "of the channels, for a spectral rgl file", "NM", type=_number(float, 1.0, 1e9), default=None
             ),
         },
         "--force",

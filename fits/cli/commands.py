@@ -15,16 +15,15 @@ import numpy as np
 from fits._files import write_bytes, write_text
 from fits.cli.input_output import DONE, DOUBTFUL, hint, read_options, refuse_alone, require_free_place, show, use_jax
 from fits.cli.maps import fit_map, is_map, report_map
-from fits.cli.materials import export, render, simulate, write_measurements
 from fits.data.geometry import slices
+from fits.data.measurements import Measurements
 from fits.data.totals import Totals
 from fits.progress import show_progress
 
 if TYPE_CHECKING:
     from fits.optimise.result import Fit
     from fits.sampling.posterior import Posterior
-
-DRAWING = "pictures and report"
+    from layerjax import Mixture, Stack
 
 # ---- a fit and what follows from it ----
 
@@ -42,12 +41,12 @@ def fit(arguments: Namespace) -> int:
     data, held_out = read_options(arguments).split(arguments.data)
     for doubt in doubtful_angles(data):
         warnings.warn(doubt, stacklevel=1)
-    given, how = read_problem(arguments.stack), {"starts": arguments.starts, "seed": arguments.seed}
+    given, how = read_problem(arguments.stack), {"starts": arguments.starts, "seed": arguments.seed, "force": force}
     resume = f"{directory} was not written; the same command resumes with the starts that are done"
     with show_progress() as progress, hint(resume):
-        whole = fit_file(directory, given, data, held_out, **how, force=force, progress=progress)
-    words = verdicts.summary(whole.fit)
-    show(tables.parameter_table(whole.fit), *words, f"Report: {directory / results.REPORT}")
+        whole = fit_file(directory, given, data, held_out, **how, progress=progress)
+    report = f"Report: {directory / results.REPORT}"
+    show(tables.parameter_table(whole.fit), *verdicts.summary(whole.fit), report)
     if held_out is not None and whole.predicted is not None:
         show(tables.scores_table(whole.predicted, held_out, "Held-out data"))
     return DONE if whole.fit.converged else DOUBTFUL
@@ -74,16 +73,13 @@ def sample(arguments: Namespace) -> int:
     settings |= {"sampler": arguments.sampler or sampler, "walkers": arguments.walkers or walkers}
     with show_progress() as progress, hint(f"the chain is kept, `layerjax sample {directory}` resumes it"):
         posterior = run_sampler(result, **settings, path=chain, resume=not arguments.force, progress=progress)
-        progress(DRAWING, 0, 1)
         if verdicts.reportable(posterior):
             results.save_posterior(posterior, directory)
+            show(tables.posterior_table(posterior))
         else:
             (directory / results.SUMMARY).unlink(missing_ok=True)
         name, held_out = directory.resolve().name, results.load_held_out(directory)
         FitReport(result, posterior, name=name, held_out=held_out).write(directory)
-        progress(DRAWING, 1, 1)
-    if verdicts.reportable(posterior):
-        show(tables.posterior_table(posterior))
     show(*verdicts.sampled(posterior), f"Report: {directory / results.REPORT}")
     enough = posterior.converged and np.min(posterior.effective_samples) >= posterior.options.ess
     if not enough:
@@ -99,23 +95,19 @@ def predict(arguments: Namespace) -> int:
         raise ValueError("predict needs one of --incidence and --score")
     if not scored and out is None:
         raise ValueError("predict --incidence needs --out FILE")
-    if scored:
-        refuse_alone(arguments, ("azimuth",), "incidence")
-    else:
-        refuse_alone(arguments, ("select", "read"), "score")
+    refuse_alone(arguments, ("azimuth",) if scored else ("select", "read"), "incidence" if scored else "score")
     require_free_place(out, arguments.force, ".csv", "predictions")
     use_jax()
     from fits.prediction.predict import predict as run_prediction
     from fits.reports import tables
 
-    source, at = _result(Path(arguments.directory)), None
+    source = _result(Path(arguments.directory))
     if scored:
-        at = read_options(arguments).read(arguments.score)
-        found = run_prediction(source, at)
+        data = read_options(arguments).read(arguments.score)
+        found = run_prediction(source, data)
+        show(tables.scores_table(found, data, f"Prediction of {arguments.score}"))
     else:
         found = run_prediction(source, slices(np.concatenate(arguments.incidence), azimuth=arguments.azimuth or (0,)))
-    if at is not None:
-        show(tables.scores_table(found, at, f"Prediction of {arguments.score}"))
     if out is not None:
         write_text(out, tables.prediction_csv(found), force=arguments.force)
         show(
@@ -140,14 +132,11 @@ def report(arguments: Namespace) -> int:
     if out is None and not os.access(directory, os.W_OK):
         raise ValueError(f"{directory}: cannot be written to (--out FILE writes the report elsewhere)")
     others = _candidates(arguments.compare, arguments.directory)
-    with show_progress() as progress:
-        progress(DRAWING, 0, 1)
-        whole = FitReport(result, posterior, others, arguments.directory, results.load_held_out(directory))
-        if out is None:
-            whole.write(directory)
-        else:
-            write_text(out, whole.page(), force=arguments.force)
-        progress(DRAWING, 1, 1)
+    whole = FitReport(result, posterior, others, arguments.directory, results.load_held_out(directory))
+    if out is None:
+        whole.write(directory)
+    else:
+        write_text(out, whole.page(), force=arguments.force)
     print(f"Report: {out or directory / results.REPORT}")
     return DONE
 
@@ -156,19 +145,14 @@ def compare(arguments: Namespace) -> int:
     """Print which of several saved fits predicts the data best."""
     if len(arguments.directories) < 2:
         raise ValueError(f"{arguments.directories[0]} is the only directory given, must be two or more")
-    require_free_place(arguments.out, arguments.force)
     use_jax()
     from fits.prediction.compare import compare as run_compare
     from fits.reports import tables
-    from fits.reports.html import comparison_page
 
     candidates = _candidates(arguments.directories)
     with show_progress() as progress:
         compared = run_compare(candidates, refit=not arguments.no_refit, progress=progress)
     show(tables.comparison_table(compared), *compared.verdict)
-    if arguments.out:
-        write_text(arguments.out, comparison_page(candidates, compared), force=arguments.force)
-        print(f"Comparison: {arguments.out}")
     return DONE
 
 
@@ -270,7 +254,110 @@ def info(arguments: Namespace) -> int:
 def convert(arguments: Namespace) -> int:
     """Read any supported format and write csv."""
     require_free_place(arguments.out, arguments.force, ".csv", "measurements")
-    return write_measurements(read_options(arguments).read(arguments.data), arguments)
+    return _write_measurements(read_options(arguments).read(arguments.data), arguments)
+
+
+def _write_measurements(data: Measurements, arguments: Namespace) -> int:
+    """Write them as csv, and print their number."""
+    from fits.data.formats.csv import write_csv
+
+    what, quantity = "measurements", "BRDF in 1/sr"
+    if isinstance(data, Totals):
+        what, quantity = "totals", "shares of the incident flux"
+        if data.spheres is not None:
+            raise ValueError(f"{data.source.path}: integrating spheres measured these, which a CSV cannot describe")
+    write_csv(data, arguments.out, force=arguments.force)
+    print(f"{arguments.out}: {len(data)} {what}, {len(data.channels)} channels, {quantity}")
+    return DONE
+
+
+# ---- materials ----
+
+
+def simulate(arguments: Namespace) -> int:
+    """Write simulated measurements of a stack; noise, scale and instrument of its file are not simulated."""
+    require_free_place(arguments.out, arguments.force, ".csv", "measurements")
+    use_jax()
+    from fits.problem.simulate import simulate as run_simulation
+    from fits.problem.stack_file import read_problem
+
+    given = read_problem(arguments.stack)
+    geometry = slices([theta for several in arguments.incidence for theta in several], azimuth=arguments.azimuth)
+    data = run_simulation(
+        _at_start(given.stack), geometry, transport=given.transport, noise=arguments.noise, seed=arguments.seed
+    )
+    return _write_measurements(data, arguments)
+
+
+def render(arguments: Namespace) -> int:
+    """Draw a material of the gallery, or of a file, or the best of a saved fit."""
+    require_free_place(arguments.out, arguments.force, ".png", "pictures")
+    use_jax()
+    from fits.optimise.result import Fit
+    from fits.reports.plots.data import as_png
+    from fits.reports.render import render as run_render
+    from layerjax import Transport
+
+    name = arguments.material
+    material, transport = _material(name)
+    if isinstance(material, Fit):
+        material.require_one("render")
+        used = material.problem.transport
+        material, transport = material.stack, used if isinstance(used, Transport) else None
+    figure = run_render(material, transport, title=Path(name).resolve().stem.replace("_", " "))
+    write_bytes(arguments.out, as_png(figure), force=arguments.force)
+    print(f"{arguments.out}: {name}")
+    return DONE
+
+
+def export(arguments: Namespace) -> int:
+    """Write a material, or the best of a saved fit, for renderers or for optical design."""
+    require_free_place(arguments.out, arguments.force)
+    use_jax()
+    from fits.exports.export import export as run_export
+
+    name = arguments.material
+    material, transport = _material(name)
+    with show_progress() as progress:
+        written = run_export(
+            material,
+            arguments.out,
+            arguments.to,
+            transport=transport,
+            wavelengths=arguments.wavelengths,
+            name=Path(name).resolve().stem,
+            force=arguments.force,
+            progress=progress,
+        )
+    print(f"{written.path}: {Path(name).name}")
+    for note in written.notes:
+        print(f"{note[0].upper()}{note[1:]}.")
+    return DONE
+
+
+def _material(name: str) -> "tuple[Fit | Stack | Mixture, Any]":
+    """A saved fit, or a stack of the gallery or of a file, at its start; and its transport, None if not given."""
+    from fits.problem.stack_file import read_problem
+    from fits.reports.results import load_fit
+    from layerjax import gallery
+
+    if Path(name).is_dir():
+        return load_fit(name), None
+    if name in gallery.names():
+        return gallery.stack(name), None
+    if Path(name).suffix == ".toml":
+        given = read_problem(name)
+        return _at_start(given.stack), None if given.transport == "auto" else given.transport
+    raise ValueError(f"{name}: neither a .toml file nor a material of the gallery: {', '.join(gallery.names())}")
+
+
+def _at_start(stack: "Stack | Mixture") -> "Stack | Mixture":
+    """The stack with every free parameter at its start value."""
+    import jax
+
+    from fits.problem.parameters import is_free, with_values
+
+    return with_values(jax.tree.map(lambda leaf: leaf.arrays()[0] if is_free(leaf) else leaf, stack, is_leaf=is_free))
 
 
 COMMANDS: dict[str, Callable[[Namespace], int]] = {

@@ -4,7 +4,7 @@ from argparse import Namespace
 from dataclasses import replace
 from pathlib import Path
 
-from fits.cli.input_output import DONE, DOUBTFUL, hint, refuse_alone, require_free_place, show, use_jax
+from fits.cli.input_output import DONE, DOUBTFUL, hint, require_free_place, show, use_jax
 from fits.progress import show_progress
 
 EMULATOR = {"auto": None, "always": True, "never": False}
@@ -25,15 +25,10 @@ def fit_map(arguments: Namespace) -> int:
     # before anything slow: what is wrong with the files is refused
     map_data(arguments.data, arguments.geometry, arguments.sigma, arguments.mask)
     prior = None
-    if arguments.spatial_prior is None:
-        refuse_alone(arguments, ("spatial_scale",), "spatial-prior")
-    else:
-        if not arguments.spatial_scale:
-            raise ValueError(f"--spatial-prior {arguments.spatial_prior} needs --spatial-scale, such as 0.05")
-        scales = dict(arguments.spatial_scale)
-        if len(scales) < len(arguments.spatial_scale) or ("" in scales and len(scales) > 1):
-            raise ValueError("--spatial-scale: must be one number for all parameters, or one for each name")
-        prior = SpatialPrior(arguments.spatial_prior, scales.get("", scales), arguments.spatial_rounds)
+    if (arguments.spatial_prior is None) != (arguments.spatial_scale is None):
+        raise ValueError("--spatial-prior needs --spatial-scale, such as 0.05, and the scale the prior")
+    if arguments.spatial_prior is not None:
+        prior = SpatialPrior(arguments.spatial_prior, arguments.spatial_scale)
     use_jax()
     from fits.maps import report
     from fits.maps.fit_map import fit_map as run

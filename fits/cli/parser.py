@@ -6,9 +6,7 @@ interrupted.
 """
 
 import os
-import signal
 import sys
-import threading
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -39,7 +37,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         from fits.cli.commands import COMMANDS
 
-        with raised_again(), warnings_in_one_line():
+        with warnings_in_one_line():
             code = COMMANDS[arguments.command](arguments)
         sys.stdout.flush()  # while an error can still be reported
         return code
@@ -86,30 +84,3 @@ def warnings_in_one_line() -> Iterator[None]:
         yield
     finally:
         warnings.showwarning = usual
-
-
-@contextmanager
-def raised_again() -> Iterator[None]:
-    """Within it, an interrupt that Python drops, as it does in callbacks of the garbage collector, is raised again.
-
-    JAX has such a callback, and a long computation spends time in it.
-    """
-    usual = sys.unraisablehook
-
-    def interrupt() -> None:
-        if hasattr(signal, "pthread_kill"):  # also in the midst of a system call
-            signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
-        else:
-            signal.raise_signal(signal.SIGINT)
-
-    def hook(dropped: Any) -> None:
-        if dropped.exc_type is KeyboardInterrupt:  # once the callback has returned
-            threading.Timer(0.05, interrupt).start()
-        else:
-            usual(dropped)
-
-    sys.unraisablehook = hook
-    try:
-        yield
-    finally:
-        sys.unraisablehook = usual

@@ -5,13 +5,14 @@ Values are the BSDF in 1/sr without the cosine. Readers of files convert to it, 
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from itertools import compress
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from fits._files import require_switch
 from fits.data.geometry import TANGENT_COSINE, Floats, Pairs
-from fits.data.selection import Angles, rows_of
+from fits.data.scans import Angles, rows_of
 from fits.names import QUANTITIES, Quantity
 
 LARGEST, SMALLEST_SIGMA = 1e30, 1e-100
@@ -68,7 +69,10 @@ class Measurements(Pairs):
     source: Source = field(default=Source(path="", format="memory"))
 
     def __post_init__(self) -> None:
-        _require_arrays(self)
+        if np.ndim(self.values) == 0:
+            raise ValueError(f"values is {self.values!r:.60}, must be an array (N, C)")
+        if isinstance(self.channels, str) or not isinstance(self.channels, Sequence):
+            raise ValueError(f"channels is {self.channels!r:.60}, must be C names")
         count, channels = len(self.values), len(self.channels)
         shapes = {"wi": (count, 3), "wo": (count, 3), "values": (count, channels), "mask": (count,)}
         if self.sigma is not None:
@@ -79,16 +83,12 @@ class Measurements(Pairs):
                 raise ValueError(f"{name} has shape {array.shape}, must be {shape}")
             if not np.isfinite(array).all():
                 raise ValueError(f"{name} holds {array[~np.isfinite(array)][0]}, must be finite")
+            if (size := np.max(np.abs(array), initial=0.0)) > LARGEST:
+                raise ValueError(f"{name} holds {size:g}, must be at most {LARGEST:g} in size")
+            if name in ("wi", "wo") and (abs((length := np.linalg.norm(array, axis=-1)) - 1) > 1e-6).any():
+                raise ValueError(f"{name} has length {length[abs(length - 1) > 1e-6][0]:g}, must be 1")
             array.setflags(write=False)
             object.__setattr__(self, name, array)
-        for name in ("values", "sigma")[: 1 if self.sigma is None else 2]:
-            size = np.max(np.abs(getattr(self, name)), initial=0.0)
-            if size > LARGEST:
-                raise ValueError(f"{name} holds {size:g}, must be at most {LARGEST:g} in size")
-        for name in ("wi", "wo"):
-            length = np.linalg.norm(getattr(self, name), axis=-1)
-            if (abs(length - 1) > 1e-6).any():
-                raise ValueError(f"{name} has length {length[abs(length - 1) > 1e-6][0]:g}, must be 1")
         if self.sigma is not None:
             if (self.sigma < 0).any():
                 raise ValueError(f"sigma is {self.sigma.min():g}, must be >= 0")
@@ -105,13 +105,13 @@ class Measurements(Pairs):
         name = self.source.path or f"{self.source.format} data"
         return f"<Measurements: {len(self):,} data points{note}, of {', '.join(self.channels)}, from {name}>"
 
-    def used(self) -> "Measurements":
+    def used(self) -> Self:
         """Only the samples that take part in fits."""
-        keep = self.mask
-        sigma = None if self.sigma is None else self.sigma[keep]
-        return replace(
-            self, wi=self.wi[keep], wo=self.wo[keep], values=self.values[keep], sigma=sigma, mask=self.mask[keep]
-        )
+        rows: dict[str, Any] = {}
+        for name in ("wi", "wo", "values", "sigma", "mask", "kinds"):  # the last of `Totals`
+            if (given := getattr(self, name, None)) is not None:
+                rows[name] = tuple(compress(given, self.mask)) if isinstance(given, tuple) else given[self.mask]
+        return replace(self, **rows)
 
     def where(self, keep: ArrayLike, note: str | None = None) -> "Measurements":
         """The same samples, masked where `keep` is False.
@@ -152,56 +152,35 @@ class Measurements(Pairs):
         Raises:
             ValueError: no argument is given, or the data hold no such sample.
         """
-        keep, own = self._chosen(incidence, azimuth, theta_o, in_plane, channels)
+        angles: dict[str, Any] = {"incidence": incidence, "azimuth": azimuth, "theta_o": theta_o, "in_plane": in_plane}
+        if channels is None and all(one is None for one in angles.values()):
+            raise ValueError(f"select: no argument is given; it takes {', '.join(angles)} and channels")
+        keep = self.mask & rows_of(self, **angles)
         if not keep.any():
             raise ValueError("select: no sample of the data fulfils all of this")
-        return self.where(keep).used().of_channels(own)
+        part = self.where(keep).used()
+        return part if channels is None else part.of_channels(channels)
 
-    def drop(
-        self,
-        *,
-        incidence: Angles | None = None,
-        azimuth: Angles | None = None,
-        theta_o: Angles | None = None,
-        in_plane: bool | None = None,
-        channels: str | Sequence[str] | None = None,
-    ) -> "Measurements":
-        """The used samples that `select` does not choose, in all channels; or the other channels for channels only.
+    def drop(self, *, channels: str | Sequence[str] | None = None, **angles: Any) -> "Measurements":
+        """The used samples that `select` does not choose by these angles, in all channels; or the other channels.
 
         Raises:
             ValueError: as `select`, no sample remains, or channels are given together with angles.
         """
-        keep, own = self._chosen(incidence, azimuth, theta_o, in_plane, channels)
-        if channels is None:
-            rest = self.where(~keep).used()
-        elif any(one is not None for one in (incidence, azimuth, theta_o, in_plane)):
+        if channels is not None and angles:
             raise ValueError("drop: channels are given together with angles; drop one after the other")
+        own = self.select(channels=channels, **angles).channels
+        if channels is None:
+            rest: Measurements = self.where(~rows_of(self, **angles)).used()
         else:
             rest = self.used().of_channels([name for name in self.channels if name not in own])
         if not rest.values.size:
             raise ValueError("drop: no sample of the data remains")
         return rest
 
-    def _chosen(
-        self,
-        incidence: Angles | None,
-        azimuth: Angles | None,
-        theta_o: Angles | None,
-        in_plane: bool | None,
-        channels: str | Sequence[str] | None,
-    ) -> tuple[NDArray[np.bool_], Sequence[str]]:
-        """Rows (N,) that fulfil all of it, and names of channels."""
-        if all(one is None for one in (incidence, azimuth, theta_o, in_plane, channels)):
-            raise ValueError(
-                "select: no argument is given; it takes incidence, azimuth, theta_o, in_plane and channels"
-            )
-        require_switch("in_plane", in_plane, None)
-        keep = self.mask & rows_of(self, incidence, azimuth, theta_o, in_plane)
-        names = self.channels if channels is None else [channels] if isinstance(channels, str) else channels
-        return keep, self.of_channels(names).channels
-
-    def of_channels(self, names: Sequence[str]) -> "Measurements":
+    def of_channels(self, names: str | Sequence[str]) -> "Measurements":
         """Only these channels, in the order of the data. ValueError for a channel that the data do not have."""
+        names = [names] if isinstance(names, str) else names
         for name in names:
             if name not in self.channels:
                 raise ValueError(f"channel {name} is not in the data; there are {', '.join(self.channels)}")
@@ -264,13 +243,6 @@ def channel_names(count: int) -> tuple[str, ...]:
     """Names for channels that have none: value, or red, green, blue, or channel1, channel2, ..."""
     known: dict[int, Sequence[str]] = {1: ("value",), 3: ("red", "green", "blue")}
     return tuple(known.get(count, [f"channel{number}" for number in range(1, count + 1)]))
-
-
-def _require_arrays(data: Measurements) -> None:
-    if np.ndim(data.values) == 0:
-        raise ValueError(f"values is {data.values!r:.60}, must be an array (N, C)")
-    if isinstance(data.channels, str) or not isinstance(data.channels, Sequence):
-        raise ValueError(f"channels is {data.channels!r:.60}, must be C names")
 
 
 def _check_angle(degrees: float, high: float) -> None:

@@ -11,11 +11,12 @@ import numpy as np
 from fits._files import given_path
 from fits.data.formats import FileOptions, read_file
 from fits.data.measurements import Measurements
-from fits.data.selection import select
+from fits.data.scans import select
 from fits.data.totals import Totals
-from fits.names import FORMATS, QUANTITIES, STRATA
 
-CHANNEL = "channel="
+CHANNELS = "channels="
+READERS = ("format", "quantity", "bins", "strata", "wavelengths", "corrected")
+"""Options of a reader that words of the command line may give."""
 
 
 def read(path: str | Path, format: str | None = None, quantity: str | None = None, **options: Any) -> Measurements:
@@ -56,7 +57,7 @@ class ReadOptions(FileOptions):
         wavelengths, corrected: for iad's files only: see `read_slab`.
         min_retro_angle: mask measurements closer than so many degrees to retro-reflection.
         max_polar_angle: mask measurements more than so many degrees from the normal.
-        select: use only these data (see `fits.data.selection.select`, and ``channel=red,green``).
+        select: use only these data (see `fits.data.scans.select`, and ``channels=red,green``).
         hold_out: hold these data out of the fit, so that their prediction can be scored.
     """
 
@@ -80,18 +81,17 @@ class ReadOptions(FileOptions):
         """Options from words such as ``format=merl`` and ``bins=5000``; more: further fields.
 
         Raises:
-            ValueError: an unknown option, one that is given twice, or a bad value.
+            ValueError: an unknown option, or one that is given twice.
         """
         options: dict[str, Any] = {}
         for word in words:
             name, equals, text = word.partition("=")
             if not equals or name not in READERS:
-                raise ValueError(
-                    f"{word!r} is no option of a reader; it must be {', '.join(f'{o}=...' for o in READERS)}"
-                )
+                allowed = ", ".join(f"{one}=..." for one in READERS)
+                raise ValueError(f"{word!r} is no option of a reader; it must be {allowed}")
             if name in options:
                 raise ValueError(f"{name} is given twice")
-            options[name] = READERS[name](name, text)
+            options[name] = _value(text)
         return cls(**options, **more)
 
     def read(self, path: str | Path) -> Measurements:
@@ -102,16 +102,23 @@ class ReadOptions(FileOptions):
 
     def split(self, path: str | Path) -> tuple[Measurements, Measurements | None]:
         """What of a file is fitted, and what is held out; None if nothing is. ValueError as `fits.read`."""
-        data = self._masked(given_path("path", path))
+        path = given_path("path", path)
+        data = read_file(path, self)
         if isinstance(data, Totals):
+            for name in ("min_retro_angle", "max_polar_angle", "select", "hold_out"):
+                if getattr(self, name):
+                    option = name.replace("_", "-")
+                    raise ValueError(
+                        f"{path}: holds totals, which have no outgoing direction; --{option} does not apply"
+                    )
             return data, None
-        kept = [select(data, words) for words in self.select if not words.startswith(CHANNEL)]
+        data = self._masked(data)
+        kept = [select(data, words) for words in self.select if not words.startswith(CHANNELS)]
         keep = np.all(kept, axis=0) if kept else np.ones(len(data), bool)
         held = np.any([select(data, words) for words in self.hold_out], axis=0) if self.hold_out else ~keep & False
         fitted = data.where(keep & ~held)
         if data.mask.any() and not fitted.mask.any():
-            what = "--select and --hold-out leave nothing to fit" if self.hold_out else "--select leaves nothing"
-            raise ValueError(f"{path}: {what}")
+            raise ValueError(f"{path}: --select and --hold-out leave nothing to fit")
         for name, given in (("selected", self.select), ("held out", self.hold_out)):
             fitted = fitted.noted(f"{name}: {' '.join(given)}") if given else fitted
         if not self.hold_out:
@@ -121,68 +128,25 @@ class ReadOptions(FileOptions):
             raise ValueError("--hold-out leaves nothing to score: what it holds out is masked or not selected")
         return fitted, held_out
 
-    def _masked(self, path: Path) -> Measurements:
+    def _masked(self, data: Measurements) -> Measurements:
         """The channels that are used, masked near retro-reflection and at grazing angles."""
-        data = read_file(path, self)
-        if isinstance(data, Totals):
-            for name in ("min_retro_angle", "max_polar_angle", "select", "hold_out"):
-                if getattr(self, name):
-                    option = name.replace("_", "-")
-                    raise ValueError(
-                        f"{path}: holds totals, which have no outgoing direction; --{option} does not apply"
-                    )
-            return data
         if self.min_retro_angle is not None:
             data = data.without_retro(self.min_retro_angle)
         if self.max_polar_angle is not None:
             data = data.without_grazing(self.max_polar_angle)
-        for words in self.hold_out:
-            if words.startswith(CHANNEL):
-                raise ValueError(
-                    f"--hold-out {words}: the parameters of a channel cannot be predicted from others; "
-                    "--select channel=... fits some of the channels"
-                )
+        if any(words.startswith(CHANNELS) for words in self.hold_out):
+            raise ValueError("--hold-out channels: the parameters of a channel cannot be predicted from others")
         for words in self.select:
-            if words.startswith(CHANNEL):
-                data = data.of_channels([name.strip() for name in words.removeprefix(CHANNEL).split(",")])
+            if words.startswith(CHANNELS):
+                data = data.of_channels([name.strip() for name in words.removeprefix(CHANNELS).split(",")])
         return data
 
 
-def _choice(name: str, text: str) -> str:
-    allowed = {"format": FORMATS, "quantity": QUANTITIES, "strata": STRATA}[name]
-    if text not in allowed:
-        raise ValueError(f"{name} is {text!r}; it must be one of {', '.join(allowed)}")
-    return text
-
-
-def _bins(name: str, text: str) -> int | str:
-    if text != "all" and not (text.isdecimal() and int(text) > 0):
-        raise ValueError(f"{name} is {text!r}; it must be a number of at least 1, or all")
-    return text if text == "all" else int(text)
-
-
-def _interval(name: str, text: str) -> tuple[float, float]:
+def _value(text: str) -> Any:
+    """A switch, a whole number, numbers, or the word itself, which the reader then judges."""
+    if text in ("yes", "no"):
+        return text == "yes"
     try:
-        low, high = map(float, text.split(","))
+        return int(text) if "," not in text else tuple(map(float, text.split(",")))
     except ValueError:
-        low = high = float("nan")
-    if not 1.0 <= low <= high < float("inf"):
-        raise ValueError(f"{name} is {text!r}; it must be the lowest and the highest in nm, as in 600,620")
-    return low, high
-
-
-def _switch(name: str, text: str) -> bool:
-    if text not in ("yes", "no"):
-        raise ValueError(f"{name} is {text!r}; it must be yes or no")
-    return text == "yes"
-
-
-READERS = {
-    "format": _choice,
-    "quantity": _choice,
-    "bins": _bins,
-    "strata": _choice,
-    "wavelengths": _interval,
-    "corrected": _switch,
-}
-"""Options of a reader by name, and what reads their values."""
+        return text

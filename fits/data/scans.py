@@ -1,14 +1,23 @@
-"""Incidences, planes and scans of measurements: how they lie in angle, and how neighbours along scans correlate."""
+"""How measurements lie in angle: incidences, planes and scans, correlation along them, and selections by angle."""
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from fits._files import require_switch
 from fits.data.geometry import AT_NORMAL as AT_NORMAL
 from fits.data.geometry import LIGHT_AZIMUTH, Pairs
 
 SAME_ANGLE = 0.5  # degrees: closer incidences are one incidence, closer azimuths one plane
 SHORTEST_SCAN = 5  # points in one plane before neighbours in it mean anything
+LISTED = 12  # the most angles of the data that an error lists; of more it names the first and the last
+
+Rows = NDArray[np.bool_]
+Angles = float | Sequence[float] | slice
 
 
 @dataclass(frozen=True)
@@ -103,17 +112,15 @@ def scans(data: Pairs) -> list[np.ndarray]:
     return ordered
 
 
-def neighbours(data: Pairs, residuals: np.ndarray, lag: int = 1) -> tuple[np.ndarray, np.ndarray]:
-    """Residuals (N, C) of pairs that lie `lag` measurements apart in a scan, two arrays; rows with NaN are skipped."""
+def neighbours(data: Pairs, residuals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Residuals (N, C) of neighbours in a scan, two arrays; rows with NaN are skipped."""
     # The mean is not subtracted: a bias over a stretch of angle is structure too.
     pairs = []
     for rows in scans(data):
         scan = residuals[rows][np.isfinite(residuals[rows]).all(axis=-1)]
-        if len(scan) > lag:
-            pairs.append((scan[:-lag].ravel(), scan[lag:].ravel()))
-    if not pairs:
-        return np.empty(0), np.empty(0)
-    return np.concatenate([first for first, _ in pairs]), np.concatenate([second for _, second in pairs])
+        pairs.append((scan[:-1].ravel(), scan[1:].ravel()))
+    first, second = zip(*pairs, strict=True) if pairs else ([np.empty(0)], [np.empty(0)])
+    return np.concatenate(first), np.concatenate(second)
 
 
 def correlation(first: np.ndarray, second: np.ndarray) -> float:
@@ -128,3 +135,73 @@ def _mean(angles: np.ndarray, turn: float | None = None) -> float:
         return round(float(np.mean(angles)), 2)
     apart = (angles - angles[0] + 0.5 * turn) % turn - 0.5 * turn
     return round(float(angles[0] + np.mean(apart)) % turn, 2) % turn
+
+
+# ---- selections ----
+
+_coplanar = in_plane  # the name of an argument below
+
+
+def rows_of(
+    data: Pairs,
+    incidence: Angles | None = None,
+    azimuth: Angles | None = None,
+    theta_o: Angles | None = None,
+    in_plane: bool | None = None,
+) -> Rows:
+    """Samples (N,) that fulfil all of these, see `Measurements.select`."""
+    require_switch("in_plane", in_plane, None)
+    chosen = np.ones(len(data), bool)
+    if incidence is not None:
+        theta = np.full(len(data), np.nan)
+        for one in incidences(data):
+            theta[one.rows] = one.theta
+        chosen &= _at(theta, "incidence", incidence)
+    if azimuth is not None:
+        chosen &= _at(planes(data), "azimuth", azimuth, 180.0)
+    if theta_o is not None:
+        chosen &= _at(data.theta_o, "theta_o", theta_o)
+    if in_plane is not None:
+        chosen &= _coplanar(data) == in_plane
+    return chosen
+
+
+def select(data: Pairs, words: str) -> Rows:
+    """Samples (N,) by words for one argument of `rows_of`: ``incidence=30,70``, ``azimuth=90``, ``theta_o=20:60``.
+
+    Raises:
+        ValueError: no such selection, or angles that the data do not hold.
+    """
+    name, equals, text = words.partition("=")
+    if not equals or name not in ("incidence", "azimuth", "theta_o"):
+        raise ValueError(f"{words!r} is no selection; it must be one of incidence=..., azimuth=..., theta_o=...")
+    low, colon, high = text.partition(":")
+    try:
+        angles: Any = slice(float(low), float(high)) if colon else [float(word) for word in text.split(",")]
+    except ValueError:
+        raise ValueError(f"{name} is {text!r}; it must be angles in degrees, as in 10,50 or 20:60") from None
+    return rows_of(data, **{name: angles})
+
+
+def _at(measured: NDArray[np.float64], name: str, angles: Angles, turn: float = math.inf) -> Rows:
+    """Which of the `measured` angles (N,) are among `angles`, modulo `turn`."""
+    if isinstance(angles, slice):
+        low = -math.inf if angles.start is None else angles.start - SAME_ANGLE
+        high = math.inf if angles.stop is None else angles.stop + SAME_ANGLE
+        if angles.step is not None or not low <= high:
+            raise ValueError(f"{name} is {angles}; it must be slice(low, high), the first not above the second")
+        return (measured >= low) & (measured <= high)
+    chosen = np.zeros(len(measured), bool)
+    for angle in np.atleast_1d(np.asarray(angles, float)):
+        distance = np.abs(measured - angle)
+        if not math.isinf(turn):
+            distance = np.minimum(distance % turn, turn - distance % turn)
+        near = distance <= SAME_ANGLE
+        if not near.any():
+            there = np.unique(measured)
+            words = f"there are {', '.join(f'{one:g}' for one in there)}"
+            if len(there) > LISTED:
+                words = f"they go from {there[0]:g} to {there[-1]:g}"
+            raise ValueError(f"{name} {angle:g} is not in the data; {words} degrees")
+        chosen |= near
+    return chosen

@@ -36,19 +36,12 @@ class Sphere:
 
     def __post_init__(self) -> None:
         for field in fields(self):
-            if not isinstance(value := getattr(self, field.name), Real):
-                raise ValueError(f"Sphere.{field.name} is {value!r:.60}, must be a number")
-        if not (math.isfinite(self.diameter) and self.diameter > 0.0):
-            raise ValueError(f"Sphere.diameter is {self.diameter}, must be above 0")
-        for name in ("sample", "entrance", "detector"):
-            if not 0.0 <= getattr(self, name) < self.diameter:
-                raise ValueError(f"Sphere.{name} is {getattr(self, name)}, must be in [0, {self.diameter:g}) mm")
-        if self.area_fraction("sample") + self.area_fraction("entrance") + self.area_fraction("detector") >= 1.0:
+            value = getattr(self, field.name)
+            below = {"diameter": math.inf, "wall": 1.0, "detector_reflectance": 1.0}.get(field.name, self.diameter)
+            if not (isinstance(value, Real) and 0.0 <= float(value) < below) or (field.name, value) == ("diameter", 0):
+                raise ValueError(f"Sphere.{field.name} is {value!r:.60}, must be a number in [0, {below:g})")
+        if sum(self.area_fraction(port) for port in ("sample", "entrance", "detector")) >= 1.0:
             raise ValueError("Sphere: the ports cover the whole wall")
-        if not 0.0 <= self.wall < 1.0:
-            raise ValueError(f"Sphere.wall is {self.wall}, must be in [0, 1)")
-        if not 0.0 <= self.detector_reflectance <= 1.0:
-            raise ValueError(f"Sphere.detector_reflectance is {self.detector_reflectance}, must be in [0, 1]")
 
     def area_fraction(self, port: str) -> float:
         """Fraction of the sphere's area that a port takes: a spherical cap."""

@@ -1,23 +1,19 @@
 """Hemispherical reflectance and transmittance and collimated transmittance, as integrating spheres measure them."""
 
-import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal, get_args
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from fits.data.geometry import LIGHT_AZIMUTH, direction
-from fits.data.measurements import Floats, Measurements, Source, channel_names
+from fits.data.measurements import Floats, Measurements, channel_names
 from fits.data.spheres import Spheres
 
 Kind = Literal["reflectance", "transmittance", "unscattered"]
 KINDS: tuple[Kind, ...] = get_args(Kind)
 """Hemispherical reflectance, hemispherical transmittance, and its collimated (unscattered) part."""
-
-BEYOND = 3.0
-"""Standard errors above 1 from which a value, or the sum of reflectance and transmittance, is warned of."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,9 +68,6 @@ class Totals(Measurements):
 
         Raises:
             ValueError: no value is given, an angle or value is out of range, or shapes do not agree.
-
-        Warns:
-            UserWarning: values, or sums of reflectance and transmittance, exceed 1 by more than 3 standard deviations.
         """
         angles = np.atleast_1d(np.asarray(incidence, float))
         if angles.ndim != 1 or not np.all((angles >= 0) & (angles < 90)):
@@ -87,59 +80,22 @@ class Totals(Measurements):
         if len(count) > 1:
             raise ValueError(f"totals: {sorted(count)} channels are given, must be as many for every kind")
         names = tuple(channels) if channels is not None else channel_names(*count)
-        spreads = {kind: _columns("sigma", _sigma_of(sigma, kind), len(angles), *count) for kind in measured}
+        sigmas = sigma if isinstance(sigma, Mapping) else dict.fromkeys(measured, sigma)
+        if missing := measured.keys() - sigmas.keys():
+            raise ValueError(f"sigma has nothing for {', '.join(sorted(missing))}")
+        spreads = {kind: _columns("sigma", sigmas[kind], len(angles), *count) for kind in measured}
         wi = direction(angles, LIGHT_AZIMUTH)
-        kinds = [kind for kind in KINDS if kind in measured for _ in angles]
-        totals = cls(
+        kinds = [kind for kind in KINDS if kind in measured for _ in angles]  # in the order of `measured`
+        return cls(
             wi=np.tile(wi, (len(measured), 1)),
-            wo=np.concatenate(
-                [wi * (-1, -1, 1 if kind == "reflectance" else -1) for kind in KINDS if kind in measured]
-            ),
-            values=np.concatenate([measured[kind] for kind in KINDS if kind in measured]),
-            sigma=np.concatenate([spreads[kind] for kind in KINDS if kind in measured]),
+            wo=np.concatenate([wi * (-1, -1, 1 if kind == "reflectance" else -1) for kind in measured]),
+            values=np.concatenate(list(measured.values())),
+            sigma=np.concatenate(list(spreads.values())),
             mask=np.ones(len(kinds), bool),
             channels=names,
-            source=Source("", "memory"),
             kinds=tuple(kinds),
             spheres=spheres,
         )
-        for message in totals.energy_violations():
-            warnings.warn(message, stacklevel=2)
-        return totals
-
-    def used(self) -> "Totals":
-        """Only the samples that take part in fits."""
-        keep: NDArray[np.bool_] = self.mask
-        return replace(
-            self,
-            wi=self.wi[keep],
-            wo=self.wo[keep],
-            values=self.values[keep],
-            sigma=None if self.sigma is None else self.sigma[keep],
-            mask=self.mask[keep],
-            kinds=tuple(kind for kind, kept in zip(self.kinds, keep, strict=True) if kept),
-        )
-
-    def energy_violations(self) -> list[str]:
-        """Values that exceed the incident light by more than their errors, a sentence each."""
-        sigma = np.zeros_like(self.values) if self.sigma is None else self.sigma
-        messages = [
-            f"{self.kinds[row]} at {self.theta_i[row]:g} degrees, {self.channels[column]}, is "
-            f"{self.values[row, column]:.4g}: more than 1 by more than {BEYOND:g} standard deviations"
-            for row, column in zip(*np.nonzero(self.values > 1.0 + BEYOND * sigma), strict=True)
-        ]
-        rows = {kind: [k for k, one in enumerate(self.kinds) if one == kind] for kind in KINDS}
-        for row in rows["reflectance"]:
-            for other in rows["transmittance"]:
-                if not np.allclose(self.wi[row], self.wi[other]):
-                    continue
-                both, error = self.values[row] + self.values[other], np.hypot(sigma[row], sigma[other])
-                messages += [
-                    f"reflectance and transmittance at {self.theta_i[row]:g} degrees, {self.channels[column]}, are "
-                    f"{both[column]:.4g} together: more than 1 by more than {BEYOND:g} standard deviations"
-                    for column in np.flatnonzero(both > 1.0 + BEYOND * error)
-                ]
-        return messages
 
 
 def _columns(name: str, value: ArrayLike, rows: int, columns: int | None = None) -> Floats:
@@ -150,11 +106,3 @@ def _columns(name: str, value: ArrayLike, rows: int, columns: int | None = None)
         return np.broadcast_to(array, (rows, columns or (array.shape[1] if array.ndim == 2 else 1))).copy()
     except ValueError:
         raise ValueError(f"{name} has shape {np.shape(value)}, must be a number, ({rows},) or ({rows}, C)") from None
-
-
-def _sigma_of(sigma: float | Mapping[str, ArrayLike], kind: str) -> ArrayLike:
-    if not isinstance(sigma, Mapping):
-        return sigma
-    if kind not in sigma:
-        raise ValueError(f"sigma has nothing for {kind}")
-    return sigma[kind]

@@ -303,7 +303,7 @@ def _figures(map: FittedMap, *figures: tuple[str, Figure]) -> str:
     """Pictures beside each other, with what each shows."""
     leading = [size // 2 for size in map.shape[:-2]]
     part = f" Slice {leading} of {' x '.join(str(size) for size in map.shape[:-2])}." if leading else ""
-    shown = (image({"": as_png(figure, trimmed=False)}, "", f"{words}{part}") for words, figure in figures)
+    shown = (image(as_png(figure, trimmed=False), f"{words}{part}") for words, figure in figures)
     return f'<div class="pair">{"".join(shown)}</div>'
 
 

@@ -8,9 +8,10 @@ import numpy as np
 from fits.data.geometry import Geometry
 from fits.data.measurements import Measurements
 from fits.optimise.result import Fit
+from fits.prediction.compare import fits_of
 from fits.prediction.cross_validation import model_scores
 from fits.prediction.options import ComparisonOptions
-from fits.prediction.predict import DRAWS, LEVELS, Prediction, predict
+from fits.prediction.predict import DRAWS, Prediction, predict
 from fits.progress import Progress
 from fits.sampling.posterior import Posterior, require_fits
 from layerjax._checks import require_kind
@@ -27,37 +28,25 @@ class Average:
     candidates: Mapping[str, Fit | Posterior]
     weights: Mapping[str, float]
 
-    def predict(
-        self,
-        at: Geometry | Measurements,
-        *,
-        levels: tuple[float, ...] = LEVELS,
-        draws: int = DRAWS,
-        seed: int = 0,
-    ) -> Prediction:
+    def predict(self, at: Geometry | Measurements, *, draws: int = DRAWS, seed: int = 0) -> Prediction:
         """See `fits.predict`; the draws are divided between the candidates in proportion to the weights."""
         # differences of rounded cumulative weights, which sum to all draws however many candidates there are
         counts = np.diff(np.round(draws * np.cumsum([0.0, *self.weights.values()])))
         parts = [
-            predict(self.candidates[name], at, levels=levels, draws=max(int(count), 2), seed=seed + number)
+            predict(self.candidates[name], at, draws=max(int(count), 2), seed=seed + number)
             for number, (name, count) in enumerate(zip(self.weights, counts, strict=True))
             if count > 0
         ]
-        first = parts[0]
-        if any(part.degrees_of_freedom != first.degrees_of_freedom for part in parts):
+        if len({part.degrees_of_freedom for part in parts}) > 1:
             raise ValueError("average: the fits differ in the tails of their noise")
-        means, scales, softness = (np.concatenate(same) for same in zip(*map(_logarithmic, parts), strict=True))
-        discrepancy_sd = None
-        if any(part.discrepancy_sd is not None for part in parts):
-            sds = [np.zeros_like(part.means) if part.discrepancy_sd is None else part.discrepancy_sd for part in parts]
-            discrepancy_sd = np.concatenate(sds)
+        means, scales, softness, sds = (np.concatenate(same) for same in zip(*map(_logarithmic, parts), strict=True))
         return replace(
-            first,
+            parts[0],
             values=np.concatenate([part.values for part in parts]),
             means=means,
             scales=scales,
             softness=softness,
-            discrepancy_sd=discrepancy_sd,
+            discrepancy_sd=None if all(part.discrepancy_sd is None for part in parts) else sds,
             seed=seed,
             pareto_k=float(np.fmax.reduce([part.pareto_k for part in parts])),
             effective_draws=sum(part.effective_draws for part in parts),
@@ -91,8 +80,8 @@ def average(
     if not candidates:
         raise ValueError("average: there is no fit to average")
     if weights is None:
-        fits = {name: one.fit if isinstance(one, Posterior) else one for name, one in candidates.items()}
-        weights = {name: score.weight for name, score in model_scores(fits, progress, options).items()}
+        scores = model_scores(fits_of(candidates), progress, options)
+        weights = {name: score.weight for name, score in scores.items()}
     total = float(sum(weights.get(name, np.nan) for name in candidates))
     if set(weights) != set(candidates) or min(weights.values()) < 0.0 or not total > 0.0:
         raise ValueError(
@@ -101,9 +90,10 @@ def average(
     return Average(dict(candidates), {name: weights[name] / total for name in candidates})
 
 
-def _logarithmic(part: Prediction) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Means, scales and softness, (D, M, C) each, of a measurement's `logarithm`."""
+def _logarithmic(part: Prediction) -> tuple[np.ndarray, ...]:
+    """Means, scales, softness and standard deviations of the discrepancy, (D, M, C) each, of the `logarithm`."""
+    sd = np.zeros_like(part.means) if part.discrepancy_sd is None else part.discrepancy_sd
     if part.softness is not None:
-        return part.means, part.scales, np.broadcast_to(part.softness, part.means.shape)
+        return part.means, part.scales, np.broadcast_to(part.softness, part.means.shape), sd
     softness = np.full(part.means.shape, LINEAR * float(np.max(np.abs(part.means)) or 1.0))
-    return part.means / softness, part.scales / softness, softness
+    return part.means / softness, part.scales / softness, softness, sd

@@ -1,10 +1,8 @@
 """Model comparison: fits of the same measurements side by side, and which of them the data prefer."""
 
 import math
-import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -21,32 +19,21 @@ from layerjax.compiling import programs_kept
 
 @dataclass(frozen=True)
 class ComparedFit:
-    """One fit in a comparison.
-
-    parameters: number of fitted parameters. aic, bic: Akaike's and the Bayesian information criterion, NaN for a named
-    objective.
-    loo: elpd by Pareto-smoothed leave-one-out, with its standard error; loo_diff: elpd difference to the best, with its
-    standard error; unreliable: number of data whose leave-one-out weight has a Pareto k that is too high. All five are
-    NaN if posteriors were not given.
-    model_score: elpd of held-out incidences, stacking weight and evidence; None without `refit`.
-    """
+    """One fit in a comparison; model_score: elpd of held-out incidences, stacking weight and evidence, with `refit`."""
 
     name: str
-    parameters: int
-    chi_square: float
-    degrees_of_freedom: int
-    reduced_chi_square: float
-    log_likelihood: float
-    aic: float
-    bic: float
-    converged: bool
-    at_bound: tuple[str, ...]
-    loo: float = math.nan
-    loo_error: float = math.nan
-    loo_diff: float = math.nan
-    loo_dse: float = math.nan
-    unreliable: float = math.nan
+    fit: Fit
     model_score: ModelScore | None = None
+
+    @property
+    def aic(self) -> float:
+        """Akaike's information criterion; NaN for a named objective."""
+        return 2.0 * len(self.fit.vector) - 2.0 * self.fit.log_likelihood
+
+    @property
+    def bic(self) -> float:
+        """The Bayesian information criterion; NaN for a named objective."""
+        return len(self.fit.vector) * math.log(self.fit.problem.count) - 2.0 * self.fit.log_likelihood
 
 
 @dataclass(frozen=True)
@@ -55,7 +42,7 @@ class Comparison:
 
     Attributes:
         rows: best first.
-        sorted_by: "elpd" (of held-out incidences), "loo", "aic" or "chi_square".
+        sorted_by: "elpd" (of held-out incidences), "aic" or "chi_square".
         verdict: one sentence for each fit other than the best, that says whether the data prefer the best to it.
         notes: cautions for reading the rows.
         options: the thresholds of verdict and notes.
@@ -71,6 +58,11 @@ class Comparison:
         return str(shown_by("fits.reports.html:comparison_fragment", self))
 
 
+def fits_of(candidates: Mapping[str, Fit | Posterior]) -> dict[str, Fit]:
+    """The fits among the candidates, and those of posteriors."""
+    return {name: one.fit if isinstance(one, Posterior) else one for name, one in candidates.items()}
+
+
 @programs_kept()
 def compare(
     candidates: Mapping[str, Fit | Posterior],
@@ -79,10 +71,10 @@ def compare(
     options: ComparisonOptions | None = None,
     progress: Progress | None = None,
 ) -> Comparison:
-    """Compare fits of the same data under the same objective; by leave-one-out if every candidate is a `Posterior`.
+    """Compare fits of the same data under the same objective, by AIC or by cross-validation.
 
     Args:
-        candidates: at least two fits or their posteriors, by name.
+        candidates: at least two fits, or posteriors of which the fits are compared, by name.
         refit: fit each again without each incidence and rank by the elpd of the held-out measurements; this takes as
             many short fits, and gives stacking weights and evidence as well.
         options: the thresholds of verdict and notes.
@@ -97,27 +89,22 @@ def compare(
     require_switch("refit", refit)
     if len(candidates) < 2:
         raise ValueError(f"compare: {len(candidates)} candidate(s) given; at least 2 are needed")
-    fits = {name: entry.fit if isinstance(entry, Posterior) else entry for name, entry in candidates.items()}
+    fits, options = fits_of(candidates), options or ComparisonOptions()
     _require_comparable(fits)
-    options = options or ComparisonOptions()
-    posteriors = {name: entry for name, entry in candidates.items() if isinstance(entry, Posterior)}
-    loo = _leave_one_out(posteriors, options) if len(posteriors) == len(candidates) else {}
-    rows = [replace(_row(name, fit), **loo.get(name, {})) for name, fit in fits.items()]
+    rows = [ComparedFit(name, fit) for name, fit in fits.items()]
     if refit:
         scores = model_scores(fits, progress, options)
-        rows = [
-            replace(row, model_score=scores[row.name]) for row in sorted(rows, key=lambda row: -scores[row.name].elpd)
-        ]
+        rows = [replace(row, model_score=scores[row.name]) for row in rows]
+        rows.sort(key=lambda row: -scores[row.name].elpd)
         sorted_by = "elpd"
-    elif loo:
-        rows.sort(key=lambda row: -row.loo)
-        sorted_by = "loo"
+    elif rows[0].fit.is_posterior:
+        rows.sort(key=lambda row: row.aic)
+        sorted_by = "aic"
     else:
-        sorted_by = "aic" if next(iter(fits.values())).is_posterior else "chi_square"
-        rows.sort(key=lambda row: getattr(row, sorted_by))
+        rows.sort(key=lambda row: row.fit.chi_square)
+        sorted_by = "chi_square"
     verdict = tuple(_verdict(rows[0], row, sorted_by, options) for row in rows[1:])
-    notes = tuple(_notes(fits, rows, len(posteriors), options))
-    return Comparison(tuple(rows), sorted_by, verdict, notes, options)
+    return Comparison(tuple(rows), sorted_by, verdict, tuple(_notes(rows, options)), options)
 
 
 def _require_comparable(fits: Mapping[str, Fit]) -> None:
@@ -135,43 +122,6 @@ def _require_comparable(fits: Mapping[str, Fit]) -> None:
             )
 
 
-def _leave_one_out(posteriors: Mapping[str, Posterior], options: ComparisonOptions) -> dict[str, dict[str, Any]]:
-    import arviz
-
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message="Estimated shape parameter of Pareto", category=UserWarning)
-        estimates = {name: arviz.loo(entry.inference_data, pointwise=True) for name, entry in posteriors.items()}
-    pointwise = {name: np.ravel(estimate.loo_i) for name, estimate in estimates.items()}
-    best = pointwise[max(estimates, key=lambda name: float(estimates[name].elpd_loo))]
-    result = {}
-    for name, estimate in estimates.items():
-        difference = best - pointwise[name]
-        result[name] = {
-            "loo": float(estimate.elpd_loo),
-            "loo_error": float(estimate.se),
-            "loo_diff": float(difference.sum()),
-            "loo_dse": float(math.sqrt(difference.size) * difference.std()),
-            "unreliable": float(np.sum(np.asarray(estimate.pareto_k) > options.max_pareto_k)),
-        }
-    return result
-
-
-def _row(name: str, fit: Fit) -> ComparedFit:
-    count, likelihood = len(fit.vector), fit.log_likelihood
-    return ComparedFit(
-        name=name,
-        parameters=count,
-        chi_square=fit.chi_square,
-        degrees_of_freedom=fit.degrees_of_freedom,
-        reduced_chi_square=fit.reduced_chi_square,
-        log_likelihood=likelihood,
-        aic=2.0 * count - 2.0 * likelihood,
-        bic=count * math.log(fit.problem.count) - 2.0 * likelihood,
-        converged=fit.converged,
-        at_bound=fit.at_bound,
-    )
-
-
 def _verdict(best: ComparedFit, other: ComparedFit, sorted_by: str, options: ComparisonOptions) -> str:
     """One sentence on whether the data prefer one fit to another.
 
@@ -183,20 +133,16 @@ def _verdict(best: ComparedFit, other: ComparedFit, sorted_by: str, options: Com
             f"{best.name} has a lower chi-square than {other.name}; without a likelihood the difference has no "
             "significance."
         )
-    excess = max(1.0, best.reduced_chi_square) if best.degrees_of_freedom > 0 else 1.0
-    scaled = f" (noise scaled to the residuals of {best.name})" if excess > 1.0 else ""
     if (score := other.model_score) is not None:
         difference = 2.0 * score.clear_diff
         words = f"elpd difference {score.elpd_diff:.1f} ± {score.dse:.1f} by cross-validation"
-    elif sorted_by == "loo":
-        loo_diff, loo_dse = other.loo_diff / excess, other.loo_dse / excess
-        difference = 2.0 * (loo_diff - options.standard_errors * loo_dse)
-        words = f"elpd difference {loo_diff:.1f} ± {loo_dse:.1f} by leave-one-out{scaled}"
     else:
-        gain = 2.0 * (best.log_likelihood - other.log_likelihood)
+        excess = max(1.0, best.fit.reduced_chi_square) if best.fit.degrees_of_freedom > 0 else 1.0
+        gain = 2.0 * (best.fit.log_likelihood - other.fit.log_likelihood)
         correction = gain / excess - gain
         aic, bic = other.aic - best.aic + correction, other.bic - best.bic + correction
         difference = min(aic, bic)
+        scaled = f" (noise scaled to the residuals of {best.name})" if excess > 1.0 else ""
         words = f"AIC difference {aic:.1f}, BIC difference {bic:.1f}{scaled}"
     if difference < options.slight_difference:
         return f"{best.name} and {other.name} are statistically indistinguishable: {words}."
@@ -204,23 +150,17 @@ def _verdict(best: ComparedFit, other: ComparedFit, sorted_by: str, options: Com
     return f"The data {prefer} {best.name} to {other.name}: {words}."
 
 
-def _notes(fits: Mapping[str, Fit], rows: list[ComparedFit], posteriors: int, options: ComparisonOptions) -> list[str]:
+def _notes(rows: list[ComparedFit], options: ComparisonOptions) -> list[str]:
     notes = []
     for what in ("noise", "transport", "scale"):
-        settings = {name: repr(getattr(fit.problem, what)) for name, fit in fits.items()}
+        settings = {row.name: repr(getattr(row.fit.problem, what)) for row in rows}
         if len(set(settings.values())) > 1:
             notes.append(f"the fits differ in {what}: " + "; ".join(f"{name}: {one}" for name, one in settings.items()))
-    failed = [row.name for row in rows if not row.converged]
-    if failed:
+    if failed := [row.name for row in rows if not row.fit.converged]:
         notes.append(f"not converged: {', '.join(failed)}")
-    unreliable = [f"{row.name} ({row.unreliable:.0f})" for row in rows if row.unreliable > 0]
-    if unreliable:
-        notes.append(f"leave-one-out is unreliable (high Pareto k) for single data of {', '.join(unreliable)}")
-    if 0 < posteriors < len(fits):
-        notes.append("there is no leave-one-out: not every candidate is a posterior")
     unsure = [row.name for row in rows if row.model_score and row.model_score.evidence.pareto_k >= options.max_pareto_k]
     if unsure:
         notes.append(f"the evidence is unreliable, its importance weights have a high Pareto k: {', '.join(unsure)}")
-    if min(row.reduced_chi_square for row in rows) > options.max_reduced_chi_square:
+    if min(row.fit.reduced_chi_square for row in rows) > options.max_reduced_chi_square:
         notes.append("no candidate explains the data within its noise: the criteria overstate differences")
     return notes

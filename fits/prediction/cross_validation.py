@@ -14,8 +14,7 @@ from typing import TYPE_CHECKING, Any
 import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.optimize import minimize
-from scipy.special import log_softmax, logsumexp, softmax
+from scipy.special import logsumexp, softmax
 
 from fits.data.geometry import Floats
 from fits.data.measurements import Measurements
@@ -36,15 +35,9 @@ from layerjax.compiling import programs_kept
 if TYPE_CHECKING:
     from fits.sampling.proposals import Density
 
-DRAWS = 128
-"""Draws of the posterior that held-out data are predicted with at a time, see `ComparisonOptions`."""
-
-INFINITE_NOISE = 1e8
-"""Noise with which a measurement does not influence a fit, in units of the largest measurement."""
-
-LARGEST_LOG_RATIO = 30.0
-"""Bound of the logarithms of ratios of stacking weights."""
-
+DRAWS = 128  # draws of the posterior that held-out data are predicted with at a time, see `ComparisonOptions`
+INFINITE_NOISE = 1e8  # noise with which a measurement does not influence a fit, in units of the largest measurement
+STACKING_STEPS = 20_000  # steps of the expectation maximisation of stacking weights, at most
 
 @dataclass(frozen=True, eq=False)
 class CrossValidation:
@@ -132,9 +125,7 @@ def _held_out(
     proposal: "Density | None",
 ) -> dict[str, Any]:
     """Log predictive density of these measurements by a fit without them, its error, and whether that converged."""
-    held_out = np.zeros(len(data), bool)
-    held_out[rows] = True
-    rest = refit(without(fit.problem, held_out), *starts)
+    rest = refit(without(fit.problem, np.isin(np.arange(len(data)), rows)), *starts)
     each, effective, error = np.empty((0, *data.values[rows].shape)), 0.0, math.inf
     while not len(each) or (error > options.monte_carlo_error and len(each) < options.most_draws):
         prediction = posterior_predictive(rest, data, draws=draws, seed=seed + len(each), proposal=proposal)
@@ -208,8 +199,7 @@ class ModelScore:
     elpd: sum of log predictive densities of measurements, each by a fit without its incidence. elpd_diff: how far it is
     below the best; dse: standard error of the difference, by the incidences and by the draws of the posterior.
     least_diff: the difference a measurement, of the incidence where that is least. clear_diff: the difference less its
-    error (see `ComparisonOptions`). weight:
-    of stacking (Yao, Vehtari, Simpson & Gelman 2018, Bayesian Anal. 13, 917). evidence: see `evidence`.
+    error (see `ComparisonOptions`). weight: of stacking (Yao, Vehtari, Simpson & Gelman 2018, Bayesian Anal. 13, 917).
     model_probability: of this stack among those compared, equally probable a priori.
     """
 
@@ -232,15 +222,10 @@ def model_scores(
     candidates: Mapping[str, Fit], progress: Progress | None = None, options: ComparisonOptions | None = None
 ) -> dict[str, ModelScore]:
     """Score fits of the same data, by name; each is fitted again without each incidence (see `cross_validate`)."""
-    results = {
-        name: out_of_sample(fit, named(name, given_progress(progress)), options=options)
-        for name, fit in candidates.items()
-    }
-    return rank_models(
-        {name: held_out for name, (held_out, _) in results.items()},
-        {name: evidence for name, (_, evidence) in results.items()},
-        options,
-    )
+    held_out, evidences = {}, {}
+    for name, fit in candidates.items():
+        held_out[name], evidences[name] = out_of_sample(fit, named(name, given_progress(progress)), options=options)
+    return rank_models(held_out, evidences, options)
 
 
 def out_of_sample(
@@ -286,26 +271,13 @@ def rank_models(
 
 
 def stacking(log_density: Floats) -> Floats:
-    """Weights (K,) of K predictions whose mixture has the highest log-density over N measurements, from (K, N)."""
-    count = len(log_density)
-    if count == 1:
-        return np.ones(1)
+    """Weights (K,) of K predictions whose mixture has the highest log-density over N measurements, from (K, N).
 
-    def cost(free: Floats) -> float:
-        logs = log_softmax(np.append(free, 0.0))
-        return -float(np.mean(logsumexp(log_density + logs[:, None], axis=0)))
-
-    def gradient(free: Floats) -> Floats:
-        weights = softmax(np.append(free, 0.0))
-        responsibility = softmax(log_density + np.log(weights)[:, None], axis=0).mean(axis=1)
-        return (weights - responsibility)[:-1]
-
-    optimum = minimize(
-        cost,
-        np.zeros(count - 1),
-        jac=gradient,
-        method="L-BFGS-B",
-        bounds=[(-LARGEST_LOG_RATIO, LARGEST_LOG_RATIO)] * (count - 1),
-        options={"ftol": 1e-14, "gtol": 1e-9},
-    )
-    return softmax(np.append(optimum.x, 0.0))
+    By expectation maximisation: the mean share of each prediction in the density of a measurement is its next weight.
+    """
+    logs = np.full(len(log_density), -math.log(len(log_density)))
+    for _ in range(STACKING_STEPS):
+        before, logs = logs, np.log(softmax(log_density + logs[:, None], axis=0).mean(axis=1) + np.finfo(float).tiny)
+        if np.max(np.abs(np.exp(logs) - np.exp(before))) < 1e-10:
+            break
+    return np.exp(logs)

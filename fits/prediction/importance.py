@@ -22,8 +22,8 @@ from fits.sampling.proposals import Density, FittedProposal
 from layerjax._checks import require_count, require_kind, require_seed
 from layerjax._numerics import broadcasting
 
+# Pareto k above which a part of the posterior may be missing; below it the draws suffice
 MAX_PARETO_K = ComparisonOptions().max_pareto_k
-"""Pareto k above which a part of the posterior may be missing; below it the draws suffice."""
 
 FINITE_VARIANCE, ROUNDS = 0.5, 3
 """Pareto k below which the variance of weights is finite, and how many mixtures are fitted to reach it."""
@@ -32,11 +32,8 @@ MIN_EFFECTIVE_DRAWS = 50
 """Effective sample size below which another proposal is tried, and to which weights are tempered before a mixture is
 fitted to them."""
 
-DRAWS = 1000
-"""Draws of each proposal for an evidence."""
-
-BATCH = 50
-"""Draws that a core evaluates at a time: however many there are, one program serves."""
+DRAWS = 1000  # draws of each proposal for an evidence
+BATCH = 50  # draws that a core evaluates at a time: however many there are, one program serves
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,58 +86,43 @@ def importance_draws(
         Jacobians. Otherwise they are used if neither approximations about the minima nor `proposal` suffice.
     proposal: an approximation of a posterior similar to the fit's.
     """
-    pool = _Pool(fit, draws, generator)
-    weighted = pool.add(initial_mixture(fit, BATCH, along_ridges=along_ridge))
-    if not along_ridge and not weighted.suffices(MAX_PARETO_K):
-        if proposal is not None:
-            weighted = pool.adapt(pool.add(proposal), max_pareto_k)
-        if not weighted.suffices(MAX_PARETO_K):
-            weighted = pool.add(initial_mixture(fit, BATCH))
-    return pool.adapt(weighted, max_pareto_k)
+    import arviz
 
+    proposals: list[Density] = []
+    positions, log_posterior = np.empty((0, len(fit.vector))), np.empty(0)
 
-class _Pool:
-    """Draws of several proposals, weighted as those of their mixture."""
-
-    def __init__(self, fit: Fit, draws: int, generator: np.random.RandomState):
-        self.fit, self.draws, self.generator = fit, draws, generator
-        self.proposals: list[Density] = []
-        self.positions = np.empty((0, len(fit.vector)))
-        self.log_posterior = np.empty(0)
-
-    def add(self, proposal: Density) -> ImportanceDraws:
-        """Add draws of a proposal; returns all draws of the pool."""
-        positions = proposal.draw(self.generator, self.draws)
-        log_posterior = log_posteriors(self.fit.problem, positions, BATCH)
-        self.proposals.append(proposal)
-        self.positions = np.concatenate([self.positions, positions])
-        self.log_posterior = np.append(self.log_posterior, log_posterior)
-        densities = [one.log_density(self.positions) for one in self.proposals]
-        weights = self.log_posterior - (logsumexp(densities, axis=0) - np.log(len(densities)))
+    def add(proposal: Density) -> ImportanceDraws:
+        """Draws of all proposals with this one, weighted as those of their mixture."""
+        nonlocal positions, log_posterior
+        new = proposal.draw(generator, draws)
+        proposals.append(proposal)
+        positions = np.concatenate([positions, new])
+        log_posterior = np.append(log_posterior, log_posteriors(fit.problem, new, BATCH))
+        densities = [one.log_density(positions) for one in proposals]
+        weights = log_posterior - (logsumexp(densities, axis=0) - np.log(len(densities)))
         weights = np.where(np.isfinite(weights), weights, -np.inf)
-        if not np.isfinite(weights).any():
-            return ImportanceDraws(self.positions, weights, np.inf)
-        return ImportanceDraws(self.positions, weights, _pareto_k(np.maximum(weights - weights.max(), -700.0)))
+        pareto_k = np.inf
+        if np.isfinite(weights).any():
+            with np.errstate(over="ignore"):  # in the tail that it fits where all weights but a few are next to nothing
+                pareto_k = float(arviz.psislw(np.maximum(weights - weights.max(), -700.0))[1])
+        return ImportanceDraws(positions, weights, pareto_k)
 
-    def adapt(self, weighted: ImportanceDraws, max_pareto_k: float) -> ImportanceDraws:
-        """Add draws of mixtures fitted to the weighted ones until they suffice."""
+    def adapt(weighted: ImportanceDraws) -> ImportanceDraws:
+        """The draws, with those of mixtures that are fitted to them until all suffice."""
         for _ in range(ROUNDS):
             if weighted.suffices(max_pareto_k) or not np.isfinite(weighted.log_weights).any():
                 break
-            rows = _resample(_tempered(weighted.log_weights), self.generator, self.draws)
-            weighted = self.add(FittedProposal.to(weighted.positions[rows], self.generator))
+            rows = _resample(_tempered(weighted.log_weights), generator, draws)
+            weighted = add(FittedProposal.to(weighted.positions[rows], generator))
         return weighted
 
-
-def _pareto_k(log_weights: Floats) -> float:
-    import arviz
-
-    if not hasattr(arviz, "psislw"):  # from 1.0 on
-        from arviz_stats.base import array_stats
-
-        return float(array_stats.psislw(log_weights)[1])
-    with np.errstate(over="ignore"):  # in the tail that it fits where all weights but a few are next to nothing
-        return float(arviz.psislw(log_weights)[1])
+    weighted = add(initial_mixture(fit, BATCH, along_ridges=along_ridge))
+    if not along_ridge and not weighted.suffices(MAX_PARETO_K):
+        if proposal is not None:
+            weighted = adapt(add(proposal))
+        if not weighted.suffices(MAX_PARETO_K):
+            weighted = add(initial_mixture(fit, BATCH))
+    return adapt(weighted)
 
 
 def _resample(log_weights: Floats, generator: np.random.RandomState, count: int) -> NDArray[np.int64]:

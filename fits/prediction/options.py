@@ -26,7 +26,7 @@ class ComparisonOptions:
     prefer a model slightly."""
 
     max_pareto_k: float = 0.7
-    """Pareto k of importance weights above which leave-one-out and evidence are unreliable (Vehtari et al. 2024)."""
+    """Pareto k of importance weights above which the evidence is unreliable (Vehtari et al. 2024)."""
 
     max_reduced_chi_square: float = 2.0
     """If the reduced chi-square of every model is above this, a note says that none explains the data."""

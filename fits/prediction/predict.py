@@ -39,30 +39,21 @@ if TYPE_CHECKING:
     from fits.sampling.proposals import Density
 
 LEVELS = (0.025, 0.25, 0.5, 0.75, 0.975)
-"""Quantiles that are computed by default: the ends of the central 50 % and 95 % intervals, and the median."""
+"""Quantiles of a `Summary`: the ends of the central 50 % and 95 % intervals, and the median."""
 
-COVERAGES = (0.5, 0.95)
-"""Central intervals whose coverage is scored."""
+COVERAGES = (0.5, 0.95)  # central intervals whose coverage is scored
+DRAWS = 256  # draws of the posterior that a prediction is made with
+MIN_PROPOSALS = 400  # the fewest weighted draws that those of a fit's posterior are resampled from
+DRAWS_PER_VECTOR = 8  # values that are drawn of the distribution of each draw of the posterior, for means and quantiles
+BISECTIONS = 50  # halvings of the interval that a quantile of the mixture lies in
 
-DRAWS = 256
-"""Draws of the posterior that a prediction is made with."""
-
-MIN_PROPOSALS = 400
-"""The fewest weighted draws that those of a fit's posterior are resampled from."""
-
-DRAWS_PER_VECTOR = 8
-"""Values that are drawn of the distribution of each draw of the posterior, for means and quantiles."""
-
-BISECTIONS = 50
-"""Halvings of the interval that a quantile of the mixture lies in."""
-
+# the least standard deviation of the discrepancy, where the data determine it: its distribution keeps a density
 SMALLEST_SD = 1e-12
-"""The least standard deviation of the discrepancy, where the data determine it: its distribution keeps a density."""
 
 
 @dataclass(frozen=True, eq=False)
 class Summary:
-    """Mean and standard deviation of M values in C channels, (M, C), and quantiles, (levels, M, C), in 1/sr."""
+    """Mean and standard deviation of M values in C channels, (M, C), and quantiles at `LEVELS`, (5, M, C), in 1/sr."""
 
     mean: Floats
     sd: Floats
@@ -76,7 +67,6 @@ class Prediction:
     Attributes:
         wi, wo: directions, (M, 3).
         channels: C names.
-        levels: levels of the quantiles.
         values: the stack's own value for each of D draws of the posterior, (D, M, C), in 1/sr.
         means, scales: location and scale of a measurement for each draw, (D, M, C), in 1/sr; with a discrepancy, of its
             `logarithm`.
@@ -94,7 +84,6 @@ class Prediction:
     wi: Floats
     wo: Floats
     channels: tuple[str, ...]
-    levels: tuple[float, ...]
     values: Floats
     means: Floats
     scales: Floats
@@ -144,7 +133,7 @@ class Prediction:
 
     def _summary(self, values: Floats) -> Summary:
         values = values.reshape(-1, *values.shape[-2:])
-        return Summary(values.mean(axis=0), values.std(axis=0), np.quantile(values, self.levels, axis=0))
+        return Summary(values.mean(axis=0), values.std(axis=0), np.quantile(values, LEVELS, axis=0))
 
     def quantile(self, level: float) -> Floats:
         """Quantile of the BSDF, (M, C), in 1/sr; level in (0, 1)."""
@@ -236,9 +225,8 @@ def scores(prediction: Prediction, measurements: Measurements, rows: NDArray[np.
     require_kind("prediction", prediction, Prediction)
     require_kind("measurements", measurements, Measurements, fix=TO_HAVE_THEM)
     used = measurements.used()
-    if used.wi.shape != prediction.wi.shape or not np.allclose(used.wo, prediction.wo) & np.allclose(
-        used.wi, prediction.wi
-    ):
+    directions = (used.wi, prediction.wi), (used.wo, prediction.wo)
+    if not all(len(own) == len(theirs) and np.allclose(own, theirs) for own, theirs in directions):
         raise ValueError("scores: the measurements have other directions than the prediction")
     chosen = np.ones(len(used), bool) if rows is None else rows
     if not chosen.any():
@@ -260,9 +248,7 @@ def scores(prediction: Prediction, measurements: Measurements, rows: NDArray[np.
 class Predictor(Protocol):
     """Several fits that predict as one: see `fits.average`."""
 
-    def predict(
-        self, at: Geometry | Measurements, *, levels: tuple[float, ...], draws: int, seed: int
-    ) -> Prediction: ...
+    def predict(self, at: Geometry | Measurements, *, draws: int, seed: int) -> Prediction: ...
 
 
 @programs_kept()
@@ -270,7 +256,6 @@ def predict(
     fitted: Fit | Posterior | Predictor,
     at: Geometry | Measurements,
     *,
-    levels: tuple[float, ...] = LEVELS,
     draws: int = DRAWS,
     seed: int = 0,
 ) -> Prediction:
@@ -281,27 +266,23 @@ def predict(
             joint fit by its normal approximation; or an average.
         at: pairs of directions in the upper hemisphere, or the lower one of a stack without a base; of `Measurements`
             their used samples, with their own sigma.
-        levels: levels of the quantiles, in (0, 1).
         draws: draws of the posterior, at least 2.
         seed: random seed of draws and noise.
 
     Measurements whose sigma is not known have the median sigma of the fitted ones, relative to the model.
 
     Raises:
-        ValueError: a level or number of draws out of range, a fit of a named objective, measurements in other channels,
+        ValueError: a number of draws out of range, a fit of a named objective, measurements in other channels,
             directions below an opaque stack, or directions that the transport does not support.
     """
-    require_kind("levels", levels, tuple, list, np.ndarray)
-    for place, level in enumerate(levels):
-        require_number(f"levels[{place}]", level, 0.0, 1.0, open_ends=True)
     require_count("draws", draws, 2)
     require_seed(seed)
     require_kind("at", at, Geometry, Measurements, fix=TO_HAVE_THEM)
     if not isinstance(fitted, Fit | Posterior):
         if isinstance(fitted, type) or not hasattr(fitted, "predict"):
             raise ValueError(f"fitted: {in_short(fitted)} is not a Fit, a Posterior or an Average")
-        return fitted.predict(at, levels=levels, draws=draws, seed=seed)
-    return posterior_predictive(fitted, at, levels=levels, draws=draws, seed=seed)
+        return fitted.predict(at, draws=draws, seed=seed)
+    return posterior_predictive(fitted, at, draws=draws, seed=seed)
 
 
 def posterior_predictive(
@@ -310,7 +291,6 @@ def posterior_predictive(
     *,
     draws: int,
     seed: int,
-    levels: tuple[float, ...] = LEVELS,
     proposal: "Density | None" = None,
 ) -> Prediction:
     """`predict` for one fit; proposal: an approximation of its posterior (see `importance_draws`), if there is one."""
@@ -327,7 +307,6 @@ def posterior_predictive(
         wi=data.wi,
         wo=data.wo,
         channels=channels,
-        levels=levels,
         values=values,
         means=means,
         scales=scales,

@@ -1,32 +1,25 @@
-"""What is in a measurement file: tables of its content, and sentences on reciprocity, energy, symmetry, sampling and
-repeated measurements (see `fits.data.checks`)."""
+"""What is in a measurement file, before any model: tables of its content, and sentences on doubtful angles,
+reciprocity, energy and repeated measurements."""
 
 import math
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import Delaunay, QhullError, cKDTree
 
-from fits.data.checks import (
-    BRIGHTER,
-    FAR,
-    Agreement,
-    Energy,
-    Peak,
-    Sides,
-    energies,
-    peaks,
-    reciprocity,
-    repeats,
-    sides,
-    symmetry,
-)
 from fits.data.measurements import Measurements
-from fits.data.scans import in_plane, incidences
+from fits.data.scans import AT_NORMAL, SAME_ANGLE, in_plane, incidences, relative_azimuth, scans, signed_angle
 from fits.data.totals import Totals
 from fits.reports.tables import Table, degrees, shortened
-from fits.reports.verdicts import DEFAULT, ReportOptions
 
-MOST_CHANNELS, MOST_ENERGIES, MOST_ANGLES = 12, 6, 24
+MOST_CHANNELS, MOST_ENERGIES, MOST_ANGLES = 6, 6, 24
 """Shown one by one: channels, incidences with an energy, and incidences in a line."""
+
+BRIGHTER = 1.3  # ratio of the brightest measurements of two sides above which one side is the brighter beyond noise
+SAME_PLACE = 0.05  # degrees within which two measurements are repeats of one
+LEAST_COVERED = 0.5  # share of the projected hemisphere that must be covered for an integral over it
+STEEP = 5.0  # polar angle of the light, in degrees, from which forward and backward are distinguished
 
 
 def source_rows(data: Measurements) -> tuple[tuple[str, str], ...]:
@@ -83,87 +76,180 @@ def data_table(data: Measurements) -> Table:
         rows.append((*angles, *map(str, counts), *ranges))
     heads = tuple(f"BRDF {channel}" for channel in data.channels) if few else ("BRDF",)
     names = ("theta_i", "phi_i", "theta_o", "count", "used", "in plane", *heads)
-    return Table("Angles, and BRDF in 1/sr", names, shortened(rows), keys=2)
+    return Table("Angles, and BRDF in 1/sr", names, shortened(rows))
 
 
 def doubtful_angles(data: Measurements) -> list[str]:
     """Sentences on angles that were probably meant otherwise: radians, azimuths from the mirror direction."""
-    total = isinstance(data, Totals)
+    words, total = [], isinstance(data, Totals)
     largest = np.max(data.theta_i if total else np.concatenate([data.theta_i, data.theta_o]), initial=0.0)
-    words = [] if total else _brighter_side(sides(data))
     if 0.0 < largest < 1.6:  # a little more than a right angle in radians
-        words.insert(0, f"Angles: none is above {largest:.4g}°: are they radians? They were read as degrees.")
-    return words
+        words.append(f"Angles: none is above {largest:.4g}°: are they radians? They were read as degrees.")
+    if total or not (seen := sides(data)):
+        return words
+    brighter = [one for one in seen if one.light > BRIGHTER * max(one.mirror, 0.0)]
+    if all(math.isnan(one.mirror) for one in seen):
+        where = "all measurements in the plane of incidence lie on the light's side"
+    elif len(brighter) > sum(one.mirror > BRIGHTER * max(one.light, 0.0) for one in seen):
+        worst = max(brighter, key=lambda one: one.light)
+        where = f"the brightest side is the light's: at {worst.theta:g}° up to {worst.light:.3g} there"
+        where = f"{where}, and {worst.mirror:.3g} on the mirror side"
+    else:
+        return words
+    return [
+        *words,
+        f"Sides: {where}. Unless the sample is retro-reflective, azimuths of this file count from the mirror "
+        "direction, which must lie at phi_o = phi_i + 180.",
+    ]
 
 
-def data_statements(data: Measurements, options: ReportOptions = DEFAULT) -> list[str]:
-    """Sentences on angles that look wrong, reciprocity, energy, symmetry, sampling and repeats of the used data; of
-    totals on angles only."""
+def data_statements(data: Measurements) -> list[str]:
+    """Sentences on angles that look wrong, reciprocity, energy and repeats of the used data; of totals on angles."""
     if isinstance(data, Totals):
         return doubtful_angles(data)
+
+    def agreement(what: str, pairs: Agreement | None) -> str:
+        if pairs is None:
+            return f"there are no measurements {what}"
+        words = f"{pairs.number:,} pairs of measurements {what} differ by {100.0 * pairs.median:.2g} %"
+        return f"{words} (median; 95 % of them by up to {100.0 * pairs.p95:.2g} %)"
+
+    energy = "no incidence is measured over half of the hemisphere, the directional albedo is unknown"
+    if known := energies(data):
+        shares = [("/".join(f"{part:.3g}" for part in one.share), one) for one in known[:MOST_ENERGIES]]
+        parts = [f"{share} at {one.theta:g}° over {100.0 * one.covered:.0f} % of it" for share, one in shares]
+        energy = f"directional albedo over the measured part of the projected hemisphere: {'; '.join(parts)}"
+    if above := [f"{one.theta:g}°" for one in known if max(one.share) > 1.0]:
+        energy = f"{energy}. It exceeds 1 at {', '.join(above)}: the scale is wrong"
     repeated = repeats(data)
     noise = "" if repeated is None else f", a noise of about {100.0 * repeated.noise:.2g} %"
     return [
         *doubtful_angles(data),
-        f"Reciprocity: {_agreement('with light and viewer exchanged', reciprocity(data))}.",
-        _energy(energies(data)),
-        f"Symmetry: {_agreement('on either side of the plane of incidence', symmetry(data))}.",
-        _sampling(peaks(data), options),
-        f"Repeats: {_agreement('along the same directions', repeated)}{noise}.",
+        f"Reciprocity: {agreement('with light and viewer exchanged', reciprocity(data))}.",
+        f"Energy: {energy}.",
+        f"Repeats: {agreement('along the same directions', repeated)}{noise}.",
     ]
 
 
-def _agreement(what: str, pairs: Agreement | None) -> str:
-    """How well pairs of measurements agree that should."""
-    if pairs is None:
-        return f"there are no measurements {what}"
-    median, most = 100.0 * pairs.median, 100.0 * pairs.p95
-    errors = "" if math.isnan(pairs.z) else f", {pairs.z:.2g} of their standard errors"
-    words = f"{pairs.count:,} pairs of measurements {what} differ by {median:.2g} %"
-    return f"{words} (median; 95 % of them by up to {most:.2g} %){errors}"
+# ---- the checks: the sample is taken to be isotropic ----
 
 
-def _brighter_side(by_incidence: list[Sides]) -> list[str]:
-    """That the brightest side is the light's, where it is: azimuths may be counted from the mirror direction."""
-    brighter = [one for one in by_incidence if one.light > BRIGHTER * max(one.mirror, 0.0)]
-    if by_incidence and all(math.isnan(one.mirror) for one in by_incidence):
-        where = "all measurements in the plane of incidence lie on the light's side"
-    elif len(brighter) <= sum(one.mirror > BRIGHTER * max(one.light, 0.0) for one in by_incidence):
-        return []
-    else:
-        worst = max(brighter, key=lambda one: one.light)
-        where = f"the brightest side is the light's: at {worst.theta:g}° up to {worst.light:.3g} there"
-        where = f"{where}, and {worst.mirror:.3g} on the mirror side"
-    return [
-        f"Sides: {where}. Unless the sample is retro-reflective, azimuths of this file count from the mirror "
-        "direction, which must lie at phi_o = phi_i + 180."
-    ]
+class Agreement(NamedTuple):
+    """Pairs of measurements that should be equal: their number, and quantiles of |difference| / mean."""
+
+    number: int
+    median: float
+    p95: float
+
+    @property
+    def noise(self) -> float:
+        """Relative standard deviation of a single measurement, for random Gaussian differences."""
+        return self.median / (0.6745 * 2.0**0.5)
 
 
-def _energy(by_incidence: list[Energy]) -> str:
-    if not by_incidence:
-        return "Energy: no incidence is measured over half of the hemisphere, the directional albedo is unknown."
-    shares = [("/".join(f"{part:.3g}" for part in one.share), one) for one in by_incidence[:MOST_ENERGIES]]
-    parts = [f"{share} at {one.theta:g}° over {100.0 * one.covered:.0f} % of it" for share, one in shares]
-    words = f"Energy: directional albedo over the measured part of the projected hemisphere: {'; '.join(parts)}."
-    above = [f"{one.theta:g}°" for one in by_incidence if max(one.share) > 1.0]
-    return f"{words} It exceeds 1 at {', '.join(above)}: the scale is wrong." if above else words
+class Energy(NamedTuple):
+    """Share (C,) of light at polar angle `theta` that is reflected into the `covered` share of the hemisphere."""
+
+    theta: float
+    share: tuple[float, ...]
+    covered: float
 
 
-def _sampling(by_incidence: list[Peak], options: ReportOptions) -> str:
-    """Whether the width of the peak about the mirror direction is sampled, where it is sampled least."""
-    if not by_incidence:
-        return "Sampling: no scan crosses the mirror direction of its light, the peak was not measured."
-    standing = [one for one in by_incidence if one.stands_out]
-    if not standing:
-        return (
-            f"Sampling: no peak stands out about the mirror direction: measurements within {FAR:g}° of it nowhere fall "
-            "to half of the brightest one."
-        )
-    worst = min(standing, key=lambda one: one.count)
-    narrow = "the peak may be narrower than the steps, which then limit a fitted roughness"
-    return (
-        "Sampling: measurements above half the height of the peak about the mirror direction: "
-        f"{worst.count} or more (at {worst.theta:g}°, in steps of {worst.step:.2g}°): "
-        f"{narrow if worst.count < options.peak_points else 'its width is sampled'}."
-    )
+class Sides(NamedTuple):
+    """Brightest measurements in the plane of incidence on the sides of light and mirror; NaN if that was not seen."""
+
+    theta: float
+    light: float
+    mirror: float
+
+
+def reciprocity(data: Measurements) -> Agreement | None:
+    """Pairs in which light and viewer change places, both above the surface; None if there is none.
+
+    If all measurements lie on one side of the plane of incidence, the sample is taken to be symmetric about it.
+    """
+    used = _above(data)
+    if not len(used):
+        return None
+    azimuth = np.radians(relative_azimuth(used))
+    side = np.where(np.abs(np.sin(azimuth)) > np.sin(np.radians(SAME_ANGLE)), np.sin(azimuth), 0.0)
+    both = side.min() < 0.0 < side.max()
+    azimuth = azimuth if both else np.abs(azimuth)
+    # polar angles, and the azimuth between them as a point of a circle: at the normal there is none
+    size = np.where(np.minimum(used.theta_i, used.theta_o) < AT_NORMAL, 0.0, np.degrees(1.0))
+    circle = size * np.cos(azimuth), size * np.sin(azimuth)
+    places = np.column_stack([used.theta_i, used.theta_o, *circle])
+    exchanged = np.column_stack([used.theta_o, used.theta_i, circle[0], -circle[1] if both else circle[1]])
+    rows = np.flatnonzero(np.abs(used.theta_i - used.theta_o) > SAME_ANGLE)
+    distance, nearest = cKDTree(places).query(exchanged[rows], distance_upper_bound=SAME_ANGLE)
+    found = np.isfinite(distance)
+    pairs = np.unique(np.sort(np.column_stack([rows[found], nearest[found]]), axis=1), axis=0)
+    return _agreement(used, *pairs[pairs[:, 0] != pairs[:, 1]].T)
+
+
+def repeats(data: Measurements) -> Agreement | None:
+    """Pairs of repeated measurements along the same directions; None if there is none."""
+    used = data.used()
+    key = np.round(np.column_stack([used.wi, used.wo]) / np.radians(SAME_PLACE)).astype(np.int64)
+    order = np.lexsort(key.T)
+    same = np.all(key[order[1:]] == key[order[:-1]], axis=1)
+    return _agreement(used, order[:-1][same], order[1:][same])
+
+
+def energies(data: Measurements) -> list[Energy]:
+    """Energy of each incidence whose measurements cover at least half of the projected hemisphere; measurements on one
+    side of the plane of incidence are mirrored."""
+    used, result = _above(data), []
+    for one in incidences(used):
+        azimuth = np.radians(relative_azimuth(used)[one.rows])
+        sine = np.sin(np.radians(used.theta_o[one.rows]))
+        points = np.column_stack([sine * np.cos(azimuth), sine * np.sin(azimuth)])
+        values = used.values[one.rows]
+        if np.all(points[:, 1] > -1e-9) or np.all(points[:, 1] < 1e-9):
+            points, values = np.concatenate([points, points * [1.0, -1.0]]), np.concatenate([values, values])
+        points, first = np.unique(np.round(points, 9), axis=0, return_index=True)
+        try:
+            corners = Delaunay(points).simplices
+        except (QhullError, ValueError):  # all in one plane
+            continue
+        a, b, c = (points[corners[:, k]] for k in range(3))
+        area = 0.5 * np.abs((b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0])
+        covered = float(area.sum() / np.pi)
+        if covered >= LEAST_COVERED:
+            share = area @ values[first][corners].mean(axis=1)
+            result.append(Energy(one.theta, tuple(map(float, share)), covered))
+    return result
+
+
+def sides(data: Measurements) -> list[Sides]:
+    """Brightest measurements of each scan in the plane of incidence, over the angles that both sides cover."""
+    used = _above(data)
+    angle, coplanar, result = signed_angle(used), in_plane(used), []
+    for rows in scans(used):
+        rows = rows[coplanar[rows]]
+        if not rows.size or used.theta_i[rows[0]] < STEEP:
+            continue
+        theta, level = angle[rows], used.values[rows].mean(axis=1)
+        if theta.min() >= -SAME_ANGLE:
+            continue
+        one_sided = theta.max() <= SAME_ANGLE
+        limit = np.inf if one_sided else min(theta.max(), -theta.min()) + SAME_ANGLE
+        light, mirror = (level[(sign * theta > SAME_ANGLE) & (sign * theta <= limit)] for sign in (-1, 1))
+        if light.size and (mirror.size or one_sided):
+            brightest = np.nan if one_sided else float(mirror.max())
+            result.append(Sides(float(used.theta_i[rows[0]]), float(light.max()), brightest))
+    return result
+
+
+def _above(data: Measurements) -> Measurements:
+    used = data.used()
+    return used.where((used.wi[:, 2] > 0.0) & (used.wo[:, 2] > 0.0)).used()
+
+
+def _agreement(used: Measurements, first: NDArray[np.int64], second: NDArray[np.int64]) -> Agreement | None:
+    one, other = used.values[first], used.values[second]
+    mean = 0.5 * (one + other)
+    if not (mean > 0.0).any():
+        return None
+    apart = np.abs(other - one)[mean > 0.0] / mean[mean > 0.0]
+    return Agreement(first.size, float(np.median(apart)), float(np.quantile(apart, 0.95)))

@@ -2,25 +2,19 @@
 
 import base64
 import html
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from string import Template
-
-Pictures = Mapping[str, bytes]
 
 
 @dataclass(frozen=True)
 class Table:
-    """A title, column heads, and rows of as many words; `note` stands below.
-
-    keys: how many columns, from the left, say what a row is of: a table too wide for a terminal repeats them.
-    """
+    """A title, column heads, and rows of as many words; `note` stands below."""
 
     title: str
     columns: tuple[str, ...]
     rows: tuple[tuple[str, ...], ...]
     note: str = ""
-    keys: int = 1
 
     def numeric(self, column: int) -> bool:
         """Whether a column holds numbers."""
@@ -82,7 +76,9 @@ def section(head: str, *parts: Part) -> str:
 
 
 def html_table(table: Table) -> str:
-    """The table as an HTML fragment, every word escaped."""
+    """The table as an HTML fragment, every word escaped; nothing of a table without rows."""
+    if not table.rows:
+        return ""
     kinds = [' class="number"' if table.numeric(index) else "" for index in range(len(table.columns))]
 
     def line(tag: str, words: Sequence[str]) -> str:
@@ -100,11 +96,8 @@ def sentences(words: Sequence[str]) -> str:
     return "<ul>" + "".join(f"<li>{html.escape(sentence)}</li>" for sentence in words) + "</ul>"
 
 
-def image(images: Pictures, name: str, caption: str) -> str:
-    """A picture with its caption; nothing if there is none of this name."""
-    if name not in images:
-        return ""
-    content = base64.b64encode(images[name]).decode("ascii")
+def image(content: bytes, caption: str) -> str:
+    """A picture, the content of a PNG file, with its caption."""
     caption = html.escape(caption)
-    picture = f'<img alt="{caption}" src="data:image/png;base64,{content}">'
+    picture = f'<img alt="{caption}" src="data:image/png;base64,{base64.b64encode(content).decode("ascii")}">'
     return f"<figure>{picture}<figcaption>{caption}</figcaption></figure>"

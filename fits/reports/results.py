@@ -6,7 +6,7 @@ problem.toml   the stack with its free parameters, noise and scale, as given
 fitted.toml    the same stack with the fitted values
 fit.json       every number of the fit, its settings, and the versions that made it; checksums of it and of these files
 chain.db       the posterior's chain, once sampled, and summary.json with its estimates
-report.html    the report, and its pictures as *.png
+report.html    the report, pictures inside
 """
 
 import shutil
@@ -29,7 +29,6 @@ from fits._files import (
     write_json,
     write_text,
 )
-from fits.data.formats import totals_csv
 from fits.data.formats.csv import write_csv
 from fits.data.measurements import Measurements, Source
 from fits.data.reading import read
@@ -84,19 +83,16 @@ def write_fit(fit: "Fit", folder: Path, text: str | None = None) -> None:
     problem, transport, data = fit.problem, fit.problem.transport, fit.problem.data
     if transport != "auto" and not isinstance(transport, Transport):
         raise ValueError(f"transport is {transport!r}: only 'auto' and layerjax's own can be saved")
-    scale, spheres = problem.scale if isinstance(problem.scale, Free) else None, None
-    if isinstance(data, Totals):
-        totals_csv.write(data.used(), folder / DATA)
-        spheres = data.spheres  # which the file cannot hold
-    else:
-        write_csv(data, folder / DATA)
+    scale = problem.scale if isinstance(problem.scale, Free) else None
+    spheres = data.spheres if isinstance(data, Totals) else None  # which the file cannot hold
+    write_csv(data, folder / DATA)
     if text is not None:
         write_text(folder / PROBLEM, text)
     else:
-        names = ("noise", "objective", "instrument")
-        settings = {name: getattr(problem, name) for name in names}
+        settings = {name: getattr(problem, name) for name in ("noise", "objective", "instrument")}
         write_problem(folder / PROBLEM, problem.stack, transport=transport, scale=scale, **settings)
     write_problem(folder / FITTED, fit.stack, transport=transport)
+    numbers = ("values", "standard_errors", "units", "chi_square", "degrees_of_freedom")
     content = {
         "layerjax_result": SCHEMA,
         "versions": versions(),
@@ -104,15 +100,10 @@ def write_fit(fit: "Fit", folder: Path, text: str | None = None) -> None:
         "source": asdict(data.source),
         "spheres": None if spheres is None else asdict(spheres),
         "fixed_scale": None if scale is not None else problem.scale,
-        **{
-            name: getattr(fit, name)
-            for name in ("values", "standard_errors", "units", "chi_square", "degrees_of_freedom")
-        },
+        **{name: getattr(fit, name) for name in numbers},
         "fit": {name: _stored(getattr(fit, name)) for name in _fields()},
         "minima": [{"values": one.values, "cost": one.cost, "count": one.count} for one in fit.minima],
-        "alternatives": [
-            index for index, one in enumerate(fit.minima) if any(one is same for same in fit.alternatives)
-        ],
+        "alternatives": [k for k, one in enumerate(fit.minima) if any(one is same for same in fit.alternatives)],
         "checksums": {name: text_checksum(folder / name) for name in (DATA, PROBLEM)},
     }
     write_json(folder / FIT, content)
@@ -128,7 +119,16 @@ def load_fit(directory: str | Path) -> "Fit":
     from fits.optimise.uncertainty import Direction
 
     directory = given_path("directory", directory)
-    content = _content(directory)
+    require_there(directory, "no such directory")
+    if not (directory / FIT).is_file():
+        raise ValueError(f"{directory}: is not a result directory, it holds no {FIT}")
+    content = read_json(directory / FIT)
+    if (version := content.get("layerjax_result")) != SCHEMA:
+        raise ValueError(f"{directory / FIT}: is version {version} of the format, must be {SCHEMA}")
+    for name in (DATA, PROBLEM):
+        require_there(directory / name)
+        if text_checksum(directory / name) != content.get("checksums", {}).get(name):
+            raise ValueError(f"{directory / name}: damaged or changed since the fit, its checksum is not that in {FIT}")
     try:
         problem = _problem(directory, content)
         stored = {name: _restored(content["fit"][name]) for name in _fields()}
@@ -148,38 +148,21 @@ def load_fit(directory: str | Path) -> "Fit":
         raise ValueError(f"{directory / FIT}: damaged, {type(error).__name__} {error}") from None
 
 
-def _content(directory: Path) -> dict[str, Any]:
-    """What fit.json holds, if it and the files with checksums in it are as they were written."""
-    require_there(directory, "no such directory")
-    if not (directory / FIT).is_file():
-        raise ValueError(f"{directory}: is not a result directory, it holds no {FIT}")
-    content = read_json(directory / FIT)
-    if (version := content.get("layerjax_result")) != SCHEMA:
-        raise ValueError(f"{directory / FIT}: is version {version} of the format, must be {SCHEMA}")
-    for name in (DATA, PROBLEM):
-        path = directory / name
-        require_there(path)
-        if text_checksum(path) != content.get("checksums", {}).get(name):
-            raise ValueError(f"{path}: damaged or changed since the fit, its checksum is not that in {FIT}")
-    return content
-
-
 def _problem(directory: Path, content: dict[str, Any]) -> "Problem":
     """The fitting problem: the stack file and the data, with what the fit chose beside them."""
     from fits.problem.problem import Problem
     from fits.problem.stack_file import read_problem, transport_from_dict
 
     given, data, spheres = read_problem(directory / PROBLEM), read(directory / DATA), content["spheres"]
-    source = Source(**content["source"] | {"notes": tuple(content["source"]["notes"])})
+    data = replace(data, source=Source(**content["source"] | {"notes": tuple(content["source"]["notes"])}))
     if isinstance(data, Totals) and spheres is not None:
         both = ("reflection", "transmission")
         spheres |= {name: None if spheres[name] is None else Sphere(**spheres[name]) for name in both}
         data = replace(data, spheres=Spheres(**spheres))
-    transport = transport_from_dict(content["transport"])
     added = content["fit"]["without_discrepancy"] is not None
     noise = replace(given.noise, discrepancy=True) if added else given.noise
     scale = given.scale if given.scale is not None else content["fixed_scale"]
-    data = replace(data, source=source)
+    transport = transport_from_dict(content["transport"])
     return Problem(given.stack, data, transport, noise, scale, given.objective, given.instrument)
 
 
@@ -312,19 +295,15 @@ def writing(directory: str | Path, force: bool = False) -> Iterator[Path]:
             folder.mkdir()
             yield folder
             check_directory(directory, force)  # someone else may have written there in the meantime
-            if not target.exists():
-                folder.rename(target)
-                return
-            with locked(target / LOCK, str(directory)):
-                target.rename(old)
-                try:
-                    folder.rename(target)
-                except OSError:
-                    old.rename(target)
-                    raise
-            shutil.rmtree(old)
+            if target.exists():
+                with locked(target / LOCK, str(directory)):
+                    target.rename(old)
+            folder.rename(target)
+            shutil.rmtree(old, ignore_errors=True)
         except BaseException as error:
             shutil.rmtree(folder, ignore_errors=True)
+            if old.exists() and not target.exists():
+                old.rename(target)
             if isinstance(error, OSError) and str(error.filename).startswith(f"{folder}"):
                 error.filename = f"{directory}{str(error.filename).removeprefix(str(folder))}"  # which the user knows
             raise

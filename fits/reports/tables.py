@@ -4,7 +4,7 @@ import csv
 import io
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, TextIO
+from typing import TYPE_CHECKING, TextIO
 
 import numpy as np
 
@@ -12,11 +12,9 @@ from fits.data.geometry import azimuth, polar
 from fits.data.measurements import Measurements
 from fits.data.scans import incidences
 from fits.optimise.limits import instrument_limits
-from fits.prediction.predict import scores
-from fits.reports.diagnostics import standardised
+from fits.prediction.predict import LEVELS, scores
 from fits.reports.pages import Table
-from fits.reports.pages import html_table as html_table
-from fits.reports.verdicts import identifiability, numerical_error
+from fits.reports.verdicts import identifiability, numerical_error, standardised
 
 if TYPE_CHECKING:
     from fits.optimise.result import Fit
@@ -33,40 +31,18 @@ UNRELIABLE = (
 
 
 def print_table(table: Table, stream: TextIO) -> None:
-    """Writes the table to `stream`: boxed and as wide as the terminal, or 120 columns where there is none.
-
-    Texts are wrapped, numbers are not: one that does not fit becomes several below each other, each with the keys.
-    """
+    """Writes the table to `stream`, as wide as the terminal or 120 columns; what is too wide is folded, never cut."""
     from rich import box
     from rich.console import Console
     from rich.table import Table as Boxed
 
     console = Console(file=stream, width=None if stream.isatty() else 120, highlight=False, markup=False)
-
-    def boxed(columns: list[int], title: str = "") -> Boxed:
-        shown = Boxed(title=title, title_justify="left", title_style="bold", box=box.SIMPLE_HEAD, pad_edge=False)
-        for index in columns:
-            longest = max(len(row[index]) for row in [table.columns, *table.rows])
-            number = table.numeric(index)
-            wraps = not number and (index == len(table.columns) - 1 or longest > 30)
-            width: dict[str, Any] = {"no_wrap": not wraps, "min_width": min(longest, 12) if wraps else longest}
-            shown.add_column(table.columns[index], justify="right" if number else "left", overflow="fold", **width)
-        for row in table.rows:
-            shown.add_row(*(row[index] for index in columns))
-        return shown
-
-    keys = list(range(table.keys))
-    parts = [keys]
-    for column in range(table.keys, len(table.columns)):
-        wider = boxed([*parts[-1], column])
-        if (
-            parts[-1] != keys
-            and console.measure(wider, options=console.options.update(width=10_000)).minimum > console.width
-        ):
-            parts.append(keys)
-        parts[-1] = [*parts[-1], column]
-    for number, part in enumerate(parts, start=1):
-        console.print(boxed(part, table.title if len(parts) == 1 else f"{table.title} ({number} of {len(parts)})"))
+    shown = Boxed(title=table.title, title_justify="left", title_style="bold", box=box.SIMPLE_HEAD, pad_edge=False)
+    for index, name in enumerate(table.columns):
+        shown.add_column(name, justify="right" if table.numeric(index) else "left", overflow="fold")
+    for row in table.rows:
+        shown.add_row(*row)
+    console.print(shown)
     if table.note:
         console.print(table.note)
 
@@ -126,10 +102,9 @@ def problem_rows(fit: "Fit") -> tuple[tuple[str, str], ...]:
         ("scale", f"fixed at {problem.scale or 1:g}" if fixed else "fitted, see the table of values"),
         ("transport", transport if fit.resolution is None else f"{transport}, {fit.resolution}"),
     ]
-    return (
-        *rows,
-        *((("numerical error of the model", numerical_error(fit.numerical_error)),) if fit.resolution else ()),
-    )
+    if fit.resolution:
+        rows.append(("numerical error of the model", numerical_error(fit.numerical_error)))
+    return tuple(rows)
 
 
 def parameter_table(fit: "Fit", both: bool = False) -> Table:
@@ -189,15 +164,13 @@ def unidentified_table(fit: "Fit") -> Table:
 
 
 def posterior_table(posterior: "Posterior") -> Table:
-    """Median, 68 % interval, mean, unit, autocorrelation time and effective sample size of each parameter."""
-    time = np.ravel(posterior.autocorrelation_time)
+    """Median, 68 % interval, standard deviation, unit and effective sample size of each parameter."""
     effective = np.broadcast_to(posterior.effective_samples, len(posterior.names))
     rows = []
-    for index, (name, (*estimates, deviation)) in enumerate(posterior.summary().items()):
-        words = (with_error(number, (estimates[2] - estimates[1]) / 2.0)[0] for number in estimates)
-        unit = posterior.fit.units[name]
-        rows.append((name, *words, f"{deviation:.2g}", unit, f"{time[index]:.0f}", f"{effective[index]:.0f}"))
-    columns = ("parameter", "median", "16 %", "84 %", "mean", "sd", "unit", "autocorr. steps", "effective samples")
+    for (name, (*interval, _, deviation)), size in zip(posterior.summary().items(), effective, strict=True):
+        words = (with_error(number, (interval[2] - interval[1]) / 2.0)[0] for number in interval)
+        rows.append((name, *words, f"{deviation:.2g}", posterior.fit.units[name], f"{size:.0f}"))
+    columns = ("parameter", "median", "16 %", "84 %", "sd", "unit", "effective samples")
     note = f"Estimates cover all {len(posterior.modes)} modes." if posterior.modes else ""
     return Table("Posterior", columns, tuple(rows), note)
 
@@ -218,25 +191,23 @@ def incidence_table(fit: "Fit") -> Table:
 
 
 def comparison_table(comparison: "Comparison") -> Table:
-    """One row per fit, the best first: goodness of fit, number of parameters, and predictive score."""
-    fits, rows = comparison.rows, []
-    aic, bic = min(fit.aic for fit in fits), min(fit.bic for fit in fits)
-    for fit in fits:
-        cells = {"fit": fit.name, "parameters": str(fit.parameters)}
-        cells |= {"chi2/dof": f"{fit.reduced_chi_square:.4g}", "chi2": f"{fit.chi_square:.5g}"}
-        if math.isfinite(aic):
-            differences = {"AIC - best": f"{fit.aic - aic:.1f}", "BIC - best": f"{fit.bic - bic:.1f}"}
-            cells |= {"log-lik.": f"{fit.log_likelihood:.2f}", **differences}
-        if all(math.isfinite(one.loo) for one in fits):
-            cells["elpd_loo diff"] = f"{fit.loo_diff:.1f} ± {fit.loo_dse:.1f}"
-        if (score := fit.model_score) is not None:
+    """One row per fit, the best first: goodness of fit, number of parameters, and predictive score or else AIC."""
+    rows = []
+    aic, bic = min(row.aic for row in comparison.rows), min(row.bic for row in comparison.rows)
+    for row in comparison.rows:
+        fit, number = row.fit, str(len(row.fit.vector))
+        cells = {"fit": row.name, "parameters": number, "chi2/dof": f"{fit.reduced_chi_square:.4g}"}
+        if (score := row.model_score) is not None:
             cells |= {"elpd": f"{score.elpd:.1f}", "elpd_diff ± dse": f"{score.elpd_diff:.1f} ± {score.dse:.1f}"}
             evidence = f"{score.evidence.log_evidence:.1f} ± {score.evidence.error:.1f}"
             cells |= {"weight": f"{score.weight:.2f}", "log evidence": evidence}
             cells["model probability"] = f"{score.model_probability:.2g}"
+        elif math.isfinite(aic):
+            differences = {"AIC - best": f"{row.aic - aic:.1f}", "BIC - best": f"{row.bic - bic:.1f}"}
+            cells |= {"log-lik.": f"{fit.log_likelihood:.2f}", **differences}
         cells |= {"converged": "yes" if fit.converged else "NO", "at a bound": ", ".join(fit.at_bound)}
         rows.append(tuple(cells.values()))
-    words = {"elpd": "cross-validated elpd", "loo": "leave-one-out", "aic": "AIC", "chi_square": "chi-square"}
+    words = {"elpd": "cross-validated elpd", "aic": "AIC", "chi_square": "chi-square"}
     notes = (f"sorted by {words[comparison.sorted_by]}, best first", *comparison.notes)
     note = " ".join(f"{line[0].upper()}{line[1:]}." for line in notes)
     return Table("Comparison", tuple(cells), tuple(rows), note)
@@ -269,7 +240,7 @@ def prediction_csv(prediction: "Prediction") -> str:
     out = io.StringIO()
     numbers: dict[str, np.ndarray] = {}
     for name, part in (("bsdf", prediction.bsdf), ("predictive", prediction.predictive), ("latent", prediction.latent)):
-        quantiles = {f"q{100.0 * level:g}": one for level, one in zip(prediction.levels, part.quantiles, strict=True)}
+        quantiles = {f"q{100.0 * level:g}": one for level, one in zip(LEVELS, part.quantiles, strict=True)}
         numbers |= {f"{name}_{what}": one for what, one in {"mean": part.mean, "sd": part.sd, **quantiles}.items()}
     angles = np.stack([polar(prediction.wi), azimuth(prediction.wi), polar(prediction.wo), azimuth(prediction.wo)], -1)
     writer = csv.writer(out, lineterminator="\n")

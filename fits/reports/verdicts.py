@@ -13,21 +13,17 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from fits.data.checks import repeats
 from fits.data.scans import correlation, neighbours
-from fits.data.totals import Totals
 from fits.optimise.limits import instrument_limits
 from fits.optimise.options import FitOptions
 from fits.optimise.result import OUTCOMES
 from fits.optimise.uncertainty import UNCONSTRAINED_BEYOND, UNIDENTIFIED_BEYOND, Direction
 from fits.problem.model import Model
 from fits.problem.noise import DEFAULT_RELATIVE
-from fits.reports.diagnostics import standardised
 from layerjax._checks import require_number
 
 if TYPE_CHECKING:
     from fits.optimise.result import Fit
-    from fits.problem.problem import Problem
     from fits.sampling.posterior import Posterior
 
 
@@ -48,9 +44,6 @@ class ReportOptions:
     prior_dominated: float = 0.3
     """Standard error, as a share of the bounds, above which a parameter is called prior-dominated."""
 
-    peak_points: int = 3
-    """Measurements above half the height of a peak from which its width is called sampled."""
-
     def __post_init__(self) -> None:
         for field in fields(self):
             require_number(f"ReportOptions.{field.name}", getattr(self, field.name), 0.0)
@@ -59,56 +52,65 @@ class ReportOptions:
 DEFAULT = ReportOptions()
 
 
+# ---- residuals ----
+
+
+def over_all_rows(fit: "Fit", values: np.ndarray) -> np.ndarray:
+    """Values (used samples, C) of a fit spread over every row of its data, (N, C); NaN in rows that were not used."""
+    mask = fit.problem.data.mask
+    spread = np.full((len(mask), np.shape(values)[1]), np.nan)
+    spread[mask] = values
+    return spread
+
+
+def standardised(fit: "Fit") -> np.ndarray:
+    """Residuals of every row that are independent standard normal if the model holds, (N, C); NaN in unused rows.
+
+    They are in units of the noise; with a model discrepancy, whitened by the covariance of both.
+    """
+    return over_all_rows(fit, fit.residuals / residual_unit(fit))
+
+
+def residual_unit(fit: "Fit") -> float:
+    """Noise, or the scatter that is left where a named objective has no noise model."""
+    return 1.0 if fit.is_posterior else math.sqrt(fit.chi_square / max(fit.degrees_of_freedom, 1))
+
+
 # ---- facts ----
 
 
 @dataclass(frozen=True)
 class Assessment:
-    """The facts of a fit that decide what is said of it; residuals are whitened where there is a model discrepancy.
-
-    Attributes:
-        count, lag_one, pairs: number of residuals, correlation of neighbours in angle (NaN without any), their number.
-        ratio, freedom: chi-square per degree of freedom, and their number.
-        excess: chi-square above its expectation, in its own standard deviations.
-        likelihood, noise_assumed: whether the objective is one, and whether no noise was stated.
-        described: whether the stack without discrepancy is as near to the data as noise and options allow.
-        misfit: factors within which half and 95 % of the data are of that stack; None if no value is above zero.
-        noise: median of the stated noise as a share of the value; NaN if none is above zero.
-        discrepancy: fitted parameters of the model discrepancy, and the reduced chi-square without it; or None.
-        words: of each parameter, what the data say of it; see `identifiability`.
-        alternatives: how many other minima fit equally well.
-        numerical_error, resolved: of the model, in standard deviations of the data, and whether it is small enough.
-    """
+    """The facts of a fit that decide what is said of it; residuals are whitened where there is a model discrepancy."""
 
     options: ReportOptions
-    count: int
-    lag_one: float
-    pairs: int
-    ratio: float
-    freedom: int
-    excess: float
+    count: int  # of residuals
+    lag_one: float  # correlation of neighbours in angle; NaN without any
+    pairs: int  # of neighbours
+    ratio: float  # chi-square per degree of freedom
+    freedom: int  # degrees of freedom
+    excess: float  # chi-square above its expectation, in its own standard deviations
     converged: bool
-    likelihood: bool
+    likelihood: bool  # whether the objective is one
     noise_assumed: bool
-    described: bool
-    misfit: tuple[float, float] | None
-    noise: float
-    discrepancy: tuple[Any, float] | None
+    described: bool  # whether the stack without discrepancy is as near to the data as noise and options allow
+    misfit: tuple[float, float] | None  # factors within which half and 95 % of the positive data are of that stack
+    noise: float  # median of the stated noise as a share of the value; NaN if none is above zero
+    discrepancy: tuple[Any, float] | None  # its parameters, and the reduced chi-square without it
     unidentified: tuple[Direction, ...]
-    words: Mapping[str, str]
-    alternatives: int
-    numerical_error: float | None
-    resolved: bool
+    words: Mapping[str, str]  # of each parameter, see `identifiability`
+    alternatives: int  # other minima that fit equally well
+    numerical_error: float | None  # of the model, in standard deviations of the data
+    resolved: bool  # whether that is small enough
 
     @property
     def size(self) -> str:
-        """Whether the residuals are significantly larger or smaller than expected: "large", "small" or "expected"."""
+        """Whether the residuals are larger or smaller than expected."""
         limit = self.options.significance
         return "large" if self.excess > limit else "small" if self.excess < -limit else "expected"
 
     @property
     def correlated(self) -> bool:
-        """Whether neighbouring residuals are significantly correlated."""
         return self.lag_one * math.sqrt(self.pairs) > self.options.significance
 
     @property
@@ -122,12 +124,10 @@ class Assessment:
 
     @property
     def which(self) -> str:
-        """The residuals that statements are about, in words."""
         return "whitened residuals" if self.discrepancy else "residuals"
 
     @property
     def expectation(self) -> str:
-        """What says how large they should be, in words."""
         return "the fitted covariance" if self.discrepancy else "the stated noise"
 
     @property
@@ -137,7 +137,6 @@ class Assessment:
 
     @property
     def identified(self) -> bool:
-        """Whether the data identify every one of these."""
         return all(word == IDENTIFIED or word.startswith(CORRELATED) for word in self.physical.values())
 
 
@@ -354,6 +353,9 @@ def _remarks(f: Assessment) -> list[Statement]:
     if not f.resolved:
         error = numerical_error(f.numerical_error)
         remarks.append(Statement(f"The numerical error of the model is {error}: a finer resolution may change values."))
+    if f.noise_assumed:
+        words = f"No noise is stated: {100.0 * DEFAULT_RELATIVE:g} % of the model's value is assumed."
+        remarks.append(Statement(f"{words} State it as `relative` under [noise], or `--noise` of a search."))
     return remarks
 
 
@@ -400,7 +402,7 @@ def verdict(fit: "Fit", facts: Assessment | None = None) -> Verdict:
             "false` to disable it."
         )
     sound = claims.get("description") == "yes" and claims["errors"] == "valid" and facts.identified and facts.resolved
-    return Verdict([one.sentence for one in said["verdict"]], [*remarks, *noise_statements(fit.problem)], sound)
+    return Verdict([one.sentence for one in said["verdict"]], remarks, sound)
 
 
 def summary(fit: "Fit") -> list[str]:
@@ -420,28 +422,6 @@ def starts_in_words(fit: "Fit") -> str:
     words = [f"{counts['best minimum']} of {total} starts{term} converged to the best minimum"]
     words += [f"{counts[key]} {word}" for key, word in OUTCOMES.items() if key != "best minimum" and counts[key]]
     return ", ".join(words) + ("; more starts may find a better one" if counts["best minimum"] == 1 < total else "")
-
-
-def noise_statements(problem: "Problem") -> list[str]:
-    """Which part of the noise was assumed, or adds to the file's own sigma."""
-    noise, used = problem.noise, problem.data.used()
-    if problem.objective != "likelihood":
-        return []
-    if problem.noise_is_assumed:
-        words = f"No noise is stated: {100.0 * DEFAULT_RELATIVE:g} % of the model's value is assumed."
-        pairs = None if isinstance(used, Totals) else repeats(used)
-        if pairs is None or not pairs.noise > 0.0:
-            return [f"{words} State it as `relative` under [noise], or `--noise` of a search."]
-        scatter = f"{pairs.count:,} repeated measurements scatter by about {100.0 * pairs.noise:.2g} %"
-        return [
-            f"{words} {scatter}: `relative = {pairs.noise:.2g}` under [noise], or `--noise` of a search, states that."
-        ]
-    if used.sigma is None or not noise.use_sigma or noise.relative in (None, 0):
-        return []
-    return [
-        "Noise: the data's own sigma and `relative` are added in quadrature. Leave `relative` out if sigma holds it "
-        "already; `use_sigma = false` ignores sigma."
-    ]
 
 
 def sampled(posterior: "Posterior") -> list[str]:

@@ -27,6 +27,7 @@ import numpy as np
 
 from fits._files import write_text
 from fits.data import geometry
+from fits.data.formats import totals_csv
 from fits.data.formats._cells import SUFFIXES, Table, in_known_case, named, names_in
 from fits.data.formats._text import Line, content, plural, read_lines
 from fits.data.geometry import Floats, Geometry
@@ -129,8 +130,8 @@ def read_directions(path: Path) -> Geometry:
 def write_csv(measurements: Measurements, path: str | Path, force: bool = False) -> None:
     """Write samples as CSV in this project's convention (BSDF in 1/sr), with their source in comments.
 
-    Values, sigma and mask come back exactly as they are, directions to 1e-10 degrees. The file appears whole or not at
-    all.
+    Values, sigma and mask come back exactly as they are, directions to 1e-10 degrees; of `Totals` the used ones, as
+    shares. The file appears whole or not at all.
 
     Args:
         measurements: what is written.
@@ -139,13 +140,13 @@ def write_csv(measurements: Measurements, path: str | Path, force: bool = False)
 
     Raises:
         ValueError: the file exists and `force` is False, or the name of a channel would not come back: "cos" (the
-            column brdf_cos holds products with the cosine), one that ends in "_std" or "_sigma", an empty one; or
-            these are `Totals`.
+            column brdf_cos holds products with the cosine), one that ends in "_std" or "_sigma", an empty one.
     """
     if not isinstance(measurements, Measurements):
         raise ValueError(f"measurements: {measurements!r:.60} is not a Measurements; {TO_HAVE_THEM}")
     if isinstance(measurements, Totals):
-        raise ValueError(f"{path}: totals are no BSDF values, which is what these columns hold")
+        totals_csv.write(measurements, path, force)
+        return
     write_text(path, csv_text(measurements), force)
 
 

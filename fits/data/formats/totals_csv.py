@@ -94,23 +94,22 @@ def read(path: Path) -> Totals:
     notes = [f"columns not used: {', '.join(ignored)}"] if ignored else []
     if empty := int(np.count_nonzero(~rows)):
         notes.append(f"skipped: {plural(empty, 'row')} without a value (an empty cell, or nan)")
-    return replace(totals, source=Source(str(path), "csv", notes=(*notes, *totals.energy_violations())))
+    return replace(totals, source=Source(str(path), "csv", notes=tuple(notes)))
 
 
 def write(totals: Totals, path: str | Path, force: bool = False) -> None:
-    """Write totals so that they come back as they are, but for spheres, of which no column tells.
+    """Write the totals that are used so that they come back as they are, but for spheres, of which no column tells.
 
     What was read several times at an angle has as many rows of it.
 
     Raises:
-        ValueError: the file exists and `force` is False, rows are masked, light comes along several directions of one
+        ValueError: the file exists and `force` is False, light comes along several directions of one
             angle, or the name of a channel would not come back.
     """
     for name in totals.channels:
         if not name or name != name.strip() or name.lower().endswith(SUFFIXES) or "," in name:
             raise ValueError(f"{path}: the name {name!r} of a channel would not come back")
-    if not totals.mask.all():
-        raise ValueError(f"{path}: rows that are not used cannot be written")
+    totals = totals.used()
     kinds = [kind for kind in KINDS if kind in totals.kinds]
     spreads = [""] if totals.sigma is None else ["", SUFFIXES[0]]
     names = [f"{COLUMNS[kind]}{_end(name)}{suffix}" for kind in kinds for suffix in spreads for name in totals.channels]

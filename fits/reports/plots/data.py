@@ -26,7 +26,6 @@ if TYPE_CHECKING:
 
 INK, GREY = "#222222", "#9a9a9a"
 CYCLE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
-NAMED = {"red": "#D55E00", "green": "#009E73", "blue": "#0072B2"}
 ANGLE_LABEL = "viewing angle θₒ, degrees (+ forward, $-$ backward)"
 LOG_ABOVE = 10.0  # ratio of the largest to the smallest value from which an axis is logarithmic
 MOST_CHANNELS, MOST_INCIDENCES = 6, 9  # in one picture, evenly spaced among all
@@ -73,10 +72,13 @@ def data_picture(data: "Measurements") -> Figure:
         if flat.any():
             panels = parts[0].subplots(1, len(data.channels), sharey=True, squeeze=False)[0]
             for channel, axes in enumerate(panels):
-                for incidence, colour in zip(shown, ordered_colours(len(shown)), strict=True):
-                    rows = incidence.rows[flat[incidence.rows]]
+                for incidence, place in zip(shown, np.linspace(0.0, 0.85, len(shown)), strict=True):  # dark to light
+                    rows, colour = (
+                        incidence.rows[flat[incidence.rows]],
+                        mpl.colors.to_hex(mpl.colormaps["viridis"](place)),
+                    )
                     draw_points(axes, data, rows[used[rows]], channel, colour, incidence.label, data.sigma)
-                    draw_points(axes, data, rows[~used[rows]], channel, GREY, None, None)
+                    draw_points(axes, data, rows[~used[rows]], channel, GREY)
                 value_axis(axes, data.values[flat], value_label(data, channel))
             if panels[0].get_legend_handles_labels()[0]:
                 panels[0].legend(loc="best", ncols=2 if len(shown) > 4 else 1)
@@ -91,70 +93,42 @@ def data_picture(data: "Measurements") -> Figure:
     return figure
 
 
-def residual_picture(data: "Measurements", residuals: np.ndarray, label: str) -> Figure:
-    """What structure standardised residuals (N, C) have along angle, and their distribution; label: what they are."""
-    from scipy import stats
-
-    finite, shown = residuals[np.isfinite(residuals)], chosen(data)
-    with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(9.5, 3.6), layout="constrained")
-        along, often = figure.subplots(1, 2, width_ratios=(2.0, 1.0))
-        along.axhspan(-1.0, 1.0, color="#eeeeee", zorder=0)
-        for incidence, colour in zip(shown, ordered_colours(len(shown)), strict=True):
-            angle = np.repeat(signed_angle(data)[incidence.rows], residuals.shape[1])
-            points: dict[str, Any] = {"markersize": 2.5, "markeredgewidth": 0.0, "label": incidence.label}
-            along.plot(angle, residuals[incidence.rows].ravel(), "o", color=colour, **points)
-        along.set(xlabel=ANGLE_LABEL, ylabel=label, title="Along angle; grey: ±1")
-        along.legend(ncols=min(len(shown), 5), loc="lower right", bbox_to_anchor=(1.0, 1.0), columnspacing=1.0)
-        edge = float(np.clip(np.abs(finite).max(), 4.0, 12.0))
-        bins = np.linspace(-edge, edge, int(np.clip(np.sqrt(finite.size) * 1.5, 16, 60)))
-        grid = np.linspace(-edge, edge, 301)
-        often.hist(np.clip(finite, -edge, edge), bins=bins.tolist(), density=True, color=CYCLE[5], label="residuals")
-        often.plot(grid, stats.norm.pdf(grid), color=INK, linewidth=1.2, label="unit normal")
-        often.set(xlabel=label, ylabel="density", title="Distribution")
-        often.legend(loc="upper right")
-    return figure
-
-
 def totals_picture(totals: Totals, fit: "Fit | None" = None) -> Figure:
-    """A panel for each kind: measured shares of the incident flux against the channel, or the angle of incidence where
-    there is but one channel, and those of the fit."""
-    kinds, channels = [kind for kind in KINDS if kind in totals.kinds], np.arange(len(totals.channels))
-    angles = list(dict.fromkeys(f"{angle:g}°" for angle in totals.theta_i))
+    """A panel for each kind: measured shares of the incident flux, and those of the fit, against the channel, or the
+    angle of incidence where there is but one channel; a colour for each angle."""
+    kinds, channels = [kind for kind in KINDS if kind in totals.kinds], totals.channels
+    angles, single = sorted(set(totals.theta_i)), len(channels) == 1
+    marks: dict[str, Any] = {}
     predicted = np.full(totals.values.shape, np.nan)
     if fit is not None:
         predicted[totals.mask] = fit.predicted
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(9.5, 3.2), layout="constrained")
         panels = figure.subplots(1, len(kinds), squeeze=False)[0]
-        marks: dict[str, Any] = {}
         for axes, kind in zip(panels, kinds, strict=True):
-            lines: list[tuple[Any, Any, Any, str]]
-            rows = np.flatnonzero([one == kind for one in totals.kinds])
-            if len(channels) == 1:
-                rows = rows[np.argsort(totals.theta_i[rows], kind="stable")]
-                lines = [(totals.theta_i[rows], rows, 0, "")]
+            own = np.flatnonzero([one == kind for one in totals.kinds])
+            own = own[np.argsort(totals.theta_i[own], kind="stable")]
+            for rows in own[None] if single else own[:, None]:
+                x, angle = totals.theta_i[rows] if single else np.arange(len(channels)), totals.theta_i[rows[0]]
+                label = "" if single or len(angles) == 1 else f" at {angle:g}°"
+                sigma = None if totals.sigma is None else totals.sigma[rows].ravel()
+                points: dict[str, Any] = {"fmt": "o", "color": INK, "markersize": 3, "capsize": 2}
+                axes.errorbar(x, totals.values[rows].ravel(), sigma, label=f"measured{label}", **points)
+                if fit is not None:
+                    colour = CYCLE[0 if single else angles.index(angle) % len(CYCLE)]
+                    shape = "-" if len(x) > 1 else "x"
+                    axes.plot(x, predicted[rows].ravel(), shape, color=colour, label=f"fit{label}")
+            if single:
                 axes.set_xlabel("angle of incidence, degrees")
             else:
-                lines = [(channels, row, channels, f"{totals.theta_i[row]:g}°") for row in rows]
-                shown = channels[:: -(-len(channels) // 12)]
-                axes.set_xticks(shown, [totals.channels[place] for place in shown], rotation=45, ha="right")
-            for x, row, channel, angle in lines:
-                colour, label = CYCLE[0], ""
-                if angle and len(angles) > 1:
-                    colour, label = CYCLE[angles.index(angle) % len(CYCLE)], f" at {angle}"
-                errors = None if totals.sigma is None else totals.sigma[row, channel]
-                points: dict[str, Any] = {"fmt": "o", "color": INK, "markersize": 3, "capsize": 2}
-                axes.errorbar(x, totals.values[row, channel], errors, label=f"measured{label}", **points)
-                if fit is not None:
-                    shape = "-" if len(x) > 1 else "x"
-                    axes.plot(x, predicted[row, channel], shape, color=colour, label=f"fit{label}")
+                ticks = range(0, len(channels), -(-len(channels) // 12))
+                axes.set_xticks(ticks, [channels[place] for place in ticks], rotation=45, ha="right")
             axes.margins(y=0.1)
             axes.set_ylim(bottom=0.0)
             axes.set_title("collimated transmittance" if kind == "unscattered" else f"total {kind}")
             marks |= {label: handle for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)}
         panels[0].set_ylabel("share of the incident flux")
-        figure.legend(marks.values(), marks.keys(), loc="outside lower center", ncols=min(len(marks), 6))
+        figure.legend(list(marks.values()), list(marks), loc="outside lower center", ncols=min(len(marks), 6))
     return figure
 
 
@@ -183,14 +157,9 @@ def value_label(data: "Measurements", channel: int) -> str:
     return "BRDF, 1/sr" if len(data.channels) == 1 else f"BRDF {data.channels[channel]}, 1/sr"
 
 
-def ordered_colours(count: int) -> list[str]:
-    """`count` colours that run from dark to light, for values that have an order."""
-    return [mpl.colors.to_hex(mpl.colormaps["viridis"](place)) for place in np.linspace(0.0, 0.85, count)]
-
-
 def channel_colour(channel: str, index: int) -> str:
     """The channel's own colour for red, green and blue, otherwise the next of the cycle."""
-    return NAMED.get(channel, CYCLE[index % len(CYCLE)])
+    return {"red": CYCLE[1], "green": CYCLE[2], "blue": CYCLE[0]}.get(channel, CYCLE[index % len(CYCLE)])
 
 
 def draw_points(
@@ -199,25 +168,16 @@ def draw_points(
     rows: np.ndarray,
     channel: int,
     colour: str,
-    label: str | None,
-    sigma: np.ndarray | None,
+    label: str | None = None,
+    sigma: np.ndarray | None = None,
 ) -> None:
     """Values of `rows` against the signed angle, with error bars from `sigma` (N, C); nothing when `rows` is empty."""
     if not rows.size:
         return
-    axes.errorbar(
-        signed_angle(data)[rows],
-        data.values[rows, channel],
-        yerr=None if sigma is None else np.nan_to_num(sigma[rows, channel]),
-        fmt="o",
-        markersize=2.5 if len(rows) > 60 else 3.5,
-        color=colour,
-        markeredgewidth=0.0,
-        elinewidth=0.6,
-        ecolor=mpl.colors.to_rgba(colour, 0.35),
-        label=label,
-        zorder=2,
-    )
+    errors = None if sigma is None else np.nan_to_num(sigma[rows, channel])
+    style: dict[str, Any] = {"fmt": "o", "markersize": 2.5 if len(rows) > 60 else 3.5, "markeredgewidth": 0.0}
+    style |= {"color": colour, "elinewidth": 0.6, "ecolor": mpl.colors.to_rgba(colour, 0.35), "zorder": 2}
+    axes.errorbar(signed_angle(data)[rows], data.values[rows, channel], errors, label=label, **style)
 
 
 def is_logarithmic(values: np.ndarray) -> bool:

@@ -1,6 +1,6 @@
-"""Pictures of a fit, and of predictions, beside data: curves per incidence, residuals, and maps out of plane."""
+"""Pictures of a fit, and of predictions, beside data, and of its parameters."""
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import matplotlib as mpl
 import numpy as np
@@ -12,7 +12,6 @@ from fits.data.geometry import Floats, direction
 from fits.data.scans import Incidence, in_plane, signed_angle
 from fits.prediction.predict import with_discrepancy
 from fits.problem.model import Model
-from fits.reports.diagnostics import bsdf, misfit, over_all_rows, residual_label
 from fits.reports.plots.data import (
     ANGLE_LABEL,
     CYCLE,
@@ -28,6 +27,7 @@ from fits.reports.plots.data import (
     value_label,
     value_norm,
 )
+from fits.reports.verdicts import over_all_rows, residual_unit
 
 if TYPE_CHECKING:
     from fits.data.measurements import Measurements
@@ -39,6 +39,28 @@ INTERVAL_DRAWS = 200  # posterior draws behind an interval
 STEEPEST = 89.9  # degrees: in the tangent plane every BRDF of a stack is 0
 STEP = 1.0  # degrees between the points of a model curve
 FEWEST_IN_PLANE = 3  # measurements that make a panel
+
+
+def bsdf(fit: "Fit") -> np.ndarray:
+    """Predicted BSDF at every row, with the model discrepancy, (N, C), in 1/sr; NaN in unused rows."""
+    used = fit.problem.data.used()
+    return over_all_rows(fit, with_discrepancy(fit, used.wi, used.wo, fit.predicted))
+
+
+def misfit(fit: "Fit") -> np.ndarray:
+    """Measurements less `bsdf`, in units of the noise, (N, C); NaN in rows that were not used.
+
+    With a model discrepancy these are smaller than the noise, since it follows the data: `standardised` are not.
+    """
+    independent = np.asarray(fit.problem.call(Model.offsets_after_discrepancy_at, fit.vector, fit.predicted), float)
+    return over_all_rows(fit, independent / residual_unit(fit))
+
+
+def residual_label(fit: "Fit") -> str:
+    """The name of an axis of a `misfit`."""
+    if not fit.is_posterior:
+        return f"residual of {fit.problem.objective} / its scatter"
+    return rf"(data $-$ {'with discrepancy' if fit.problem.noise.discrepancy else 'model'}) / $\sigma$"
 
 
 def curves_picture(fits: "dict[str, Fit]", posterior: "Posterior | None" = None) -> Figure | None:
@@ -99,43 +121,36 @@ def _in_plane(data: "Measurements") -> list[Incidence]:
     return [Incidence(one.theta, one.phi, one.rows[flat[one.rows]]) for one in enough]
 
 
-class _Curve(NamedTuple):
-    """The model along one incidence: viewing angles (M,), values (M, C), and an interval's two ends (2, M, C) or None.
+def _curves(fit: "Fit", shown: list[Incidence], posterior: "Posterior | None") -> list[tuple[Any, ...]]:
+    """The model along each incidence, all of them predicted at once.
 
-    latent: (M, C), of the stack without the model discrepancy, as is the interval; None where there is no discrepancy.
+    Viewing angles (M,), BSDF (M, C), that of the stack without the model discrepancy, and the ends of an interval of
+    the latter, (2, M, C); None where there is no discrepancy, or no posterior.
     """
-
-    angle: Floats
-    values: Floats
-    latent: Floats | None
-    interval: Floats | None
-
-
-def _curves(fit: "Fit", shown: list[Incidence], posterior: "Posterior | None") -> list[_Curve]:
-    """The model along each incidence, all of them predicted at once."""
-    data, signed = fit.problem.data, signed_angle(fit.problem.data)
-    angles, wi, wo = [], [], []
+    signed, angles = signed_angle(fit.problem.data), []
     for incidence in shown:
         own = signed[incidence.rows]
         angle = np.arange(np.floor(own.min()), np.ceil(own.max()) + STEP / 2, STEP)
         angles.append(np.clip(angle, -STEEPEST, STEEPEST))
-        wi.append(np.tile(direction(incidence.theta, incidence.phi), (len(angle), 1)))
-        wo.append(direction(angles[-1], incidence.phi + 180.0))
+    each = list(zip(shown, angles, strict=True))
+    wi = np.concatenate([np.tile(direction(one.theta, one.phi), (len(angle), 1)) for one, angle in each])
+    wo = np.concatenate([direction(angle, one.phi + 180.0) for one, angle in each])
     vectors = fit.vector[None]
     if posterior is not None:
         picked = np.linspace(0, len(posterior.samples) - 1, INTERVAL_DRAWS).astype(int)
         vectors = np.concatenate([vectors, np.asarray(posterior.samples)[picked]])
-    towards = np.concatenate(wi), np.concatenate(wo)
-    values = np.asarray(fit.problem.predict_at(vectors, *towards))
-    values = np.broadcast_to(values, (*values.shape[:2], data.values.shape[1]))  # a grey stack is the same in all
+    values = np.asarray(fit.problem.predict_at(vectors, wi, wo))
+    values = np.broadcast_to(
+        values, (*values.shape[:2], len(fit.problem.data.channels))
+    )  # a grey stack is the same in all
+
+    def parts(along: Floats | None, axis: int = 0) -> list[Any]:
+        cuts = np.cumsum([len(angle) for angle in angles])[:-1]
+        return [None] * len(angles) if along is None else np.split(along, cuts, axis)
+
+    best, latent = with_discrepancy(fit, wi, wo, values[0]), values[0] if fit.problem.noise.discrepancy else None
     interval = None if posterior is None else np.quantile(values[1:], [0.025, 0.975], axis=0)
-    best = with_discrepancy(fit, *towards, values[0])
-    curves = []
-    for angle, end in zip(angles, np.cumsum([len(angle) for angle in angles]), strict=True):
-        own = slice(end - len(angle), end)
-        latent = values[0, own] if fit.problem.noise.discrepancy else None
-        curves.append(_Curve(angle, best[own], latent, None if interval is None else interval[:, own]))
-    return curves
+    return list(zip(angles, parts(best), parts(latent), parts(interval, 1), strict=True))
 
 
 def _points(axes: Axes, fit: "Fit", rows: np.ndarray, coloured: bool) -> None:
@@ -149,22 +164,22 @@ def _points(axes: Axes, fit: "Fit", rows: np.ndarray, coloured: bool) -> None:
         colour = channel_colour(name, channel) if coloured else INK
         label = f"{what}, {name}" if len(data.channels) > 1 else what
         draw_points(axes, data, rows[used], channel, colour, label, sigma)
-        draw_points(axes, data, rows[~used], channel, GREY, None if channel else "not used", None)
+        draw_points(axes, data, rows[~used], channel, GREY, None if channel else "not used")
 
 
-def _line(axes: Axes, curve: _Curve, channel: int, colour: str, label: str | None, place: int) -> None:
+def _line(axes: Axes, curve: tuple[Any, ...], channel: int, colour: str, label: str | None, place: int) -> None:
     """One channel of a model, labelled for the legend where it is the first."""
-    discrepancy = curve.latent is not None
-    what = f"{label} with discrepancy" if label and discrepancy else label
-    axes.plot(curve.angle, curve.values[:, channel], color=colour, linewidth=1.3, label=what, zorder=3)
-    if curve.latent is not None:
+    angle, values, latent, interval = curve
+    what = label if label is None or latent is None else f"{label} with discrepancy"
+    axes.plot(angle, values[:, channel], color=colour, linewidth=1.3, label=what, zorder=3)
+    if latent is not None:
         what = "without discrepancy" if label and not place else None
-        axes.plot(curve.angle, curve.latent[:, channel], "--", color=colour, linewidth=1.0, label=what, zorder=3)
-    if curve.interval is not None:
-        which = ", without discrepancy" if discrepancy else ""
+        axes.plot(angle, latent[:, channel], "--", color=colour, linewidth=1.0, label=what, zorder=3)
+    if interval is not None:
+        which = ", without discrepancy" if latent is not None else ""
         what = f"95 % of the posterior{which}" if label else None
-        low, high = curve.interval[:, :, channel]
-        axes.fill_between(curve.angle, low, high, color=colour, alpha=0.3, linewidth=0.0, label=what, zorder=2.5)
+        low, high = interval[:, :, channel]
+        axes.fill_between(angle, low, high, color=colour, alpha=0.3, linewidth=0.0, label=what, zorder=2.5)
 
 
 def maps_picture(fit: "Fit", channel: int = 0) -> Figure | None:
@@ -189,7 +204,7 @@ def maps_picture(fit: "Fit", channel: int = 0) -> Figure | None:
                 axes.set_title(f"{incidence.label}: {what}")
         bar: dict[str, Any] = {"shrink": 0.7, "aspect": 30}
         figure.colorbar(image, ax=panels[:, :2].ravel().tolist(), label=value_label(data, channel), **bar)
-        label = residual_label(fit, whitened=False)
+        label = residual_label(fit)
         figure.colorbar(signed, ax=panels[:, 2].tolist(), label=label, extend="both", **bar)
     return figure
 
@@ -224,4 +239,50 @@ def prediction_picture(prediction: "Prediction", data: "Measurements") -> Figure
         figure.supxlabel(ANGLE_LABEL, fontsize="medium")
         handles, labels = grid[0, 0].get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside lower center", ncols=len(labels))
+    return figure
+
+
+def corner_picture(posterior: "Posterior") -> Figure:
+    """Every pair of parameters and every single parameter, over the posterior's samples; lines at the fitted values."""
+    import corner
+
+    count = len(posterior.names)
+    side = float(np.clip(1.6 * count, 4.0, 11.0))
+    best = [posterior.fit.values[name] for name in posterior.names]
+    with mpl.rc_context(STYLE | {"axes.grid": False, "axes.titlesize": 8}):
+        figure = Figure(figsize=(side, side))
+        corner.corner(
+            np.asarray(posterior.samples),
+            labels=list(posterior.names),
+            titles=[f"{name}\n" for name in posterior.names],
+            quantiles=(0.16, 0.5, 0.84),
+            show_titles=True,
+            title_fmt=".3g",
+            truths=best,
+            truth_color=CYCLE[1],
+            color=CYCLE[0],
+            hist_kwargs={"color": CYCLE[0]},
+            label_kwargs={"fontsize": 8},
+            max_n_ticks=3,
+            labelpad=0.1,
+            fig=figure,
+            quiet=bool(posterior.modes),  # of modes narrower than a bin there are no contours
+        )
+    return figure
+
+
+def correlation_picture(fit: "Fit") -> Figure:
+    """The correlation matrix of the fitted parameters, with its numbers."""
+    names, matrix = list(fit.values), np.round(fit.correlation, 2)
+    side = float(np.clip(0.75 * len(names) + 2.0, 3.5, 9.0))
+    with mpl.rc_context(STYLE | {"axes.grid": False}):
+        figure = Figure(figsize=(side + 0.8, side), layout="constrained")
+        axes = figure.subplots()
+        image = axes.imshow(matrix, cmap="PuOr", vmin=-1.0, vmax=1.0)
+        axes.set_xticks(range(len(names)), names, rotation=40, ha="right", rotation_mode="anchor")
+        axes.set_yticks(range(len(names)), names)
+        for (row, column), value in np.ndenumerate(matrix):
+            colour = "white" if abs(value) > 0.6 else INK
+            axes.text(column, row, f"{value + 0.0:.2f}", ha="center", va="center", fontsize=8, color=colour)
+        figure.colorbar(image, ax=axes, label="correlation", shrink=0.8)
     return figure

@@ -1,14 +1,11 @@
 """The `layerjax` command at work: every command writes and prints what it should."""
 
 import csv
-import gc
 import io
 import json
 import os
-import signal
 import subprocess
 import sys
-import time
 import warnings
 from dataclasses import replace
 from pathlib import Path
@@ -19,12 +16,11 @@ import pytest
 import layerjax as lj
 from fits.cli import commands
 from fits.cli.arguments import COMMANDS
-from fits.cli.parser import main, raised_again
+from fits.cli.parser import main
 from fits.data.reading import read
 from fits.engines import run
 from fits.problem.problem import Problem
 from fits.reports.html import FitReport
-from fits.reports.plots.data import MOST_CHANNELS, data_picture
 from fits.reports.results import load_fit, load_posterior, save_fit
 from tests.helpers import tasks
 from tests.helpers.coats import make_folder
@@ -51,7 +47,7 @@ def test_fit_writes_a_result(work, capsys, coat_toml):
     assert stored["values"] == result.values
     assert {"starts": 4, "seed": 0}.items() <= stored["fit"]["settings"].items()
     assert "low" not in (work / "result" / "fitted.toml").read_text()
-    assert {"model.png", "maps.png", "residuals.png", "report.html"} <= {path.name for path in Path("result").iterdir()}
+    assert "data:image/png;base64," in (work / "result" / "report.html").read_text()
     assert "--force" in refused([*words], capsys, work)
 
 
@@ -61,10 +57,9 @@ def test_results_are_compared(work, capsys, coat_fit):
     other = replace(coat_fit, problem=Problem(problem.stack, problem.data, objective="cube_root"))
     for name, fit in (("best", coat_fit), ("worse", worse), ("root", other)):
         save_fit(fit, name)
-    assert main(["compare", "worse", "best", "--out", "both.html"]) == 0
+    assert main(["compare", "worse", "best", "--no-refit"]) == 0
     words = capsys.readouterr().out
     assert words.index(" best ") < words.index(" worse ")
-    assert "data:image/png;base64," in (work / "both.html").read_text()
     assert "twice" in refused(["compare", "best", "best/../best"], capsys, work)
     assert "cube_root" in refused(["compare", "best", "root"], capsys, work)
     assert "no posterior" in refused(["sample", "root"], capsys, work)
@@ -94,7 +89,7 @@ def test_sampling_resumes_until_it_is_enough(work, capsys, coat_fit, monkeypatch
         assert abs(entry["mean"] - coat_fit.values[name]) < coat_fit.standard_errors[name]
         assert entry["low_68"] < entry["median"] < entry["high_68"]
     pictures = (work / "result" / "report.html").read_text().count("data:image/png")
-    assert pictures == 6  # curves, maps, residuals, correlation, corner, trace
+    assert pictures == 4  # curves, maps, correlation, corner
     with monkeypatch.context() as patch:
         patch.setattr(FitReport, "write", lambda *_: None)
         assert main(["sample", "result", "--ess", "1000000", "--max-steps", str(len(longer.chain))]) == 1
@@ -124,15 +119,15 @@ def test_many_files_are_fitted_as_one_is(work, capsys, monkeypatch):
 def test_held_out_data_are_scored(work, capsys, monkeypatch):
     monkeypatch.setattr(FitReport, "write", lambda *_: None)
     words = ["fit", "data.csv", "--stack", "coat.toml", "--out", "result", "--starts", "2"]
-    assert main([*words, "--select", "plane=0", "--hold-out", "incidence=50"]) == 0
+    assert main([*words, "--select", "azimuth=0", "--hold-out", "incidence=50"]) == 0
     output = capsys.readouterr().out
     assert "Held-out data" in output
     assert "θᵢ = 50°" in output
     data = load_fit("result").problem.data
     np.testing.assert_allclose(data.theta_i[data.mask], 10.0)
     assert np.all(np.abs(np.sin(np.radians(data.phi_o[data.mask]))) < 1e-9)
-    assert {"selected: plane=0", "held out: incidence=50"} <= set(data.source.notes)
-    assert main(["predict", "result", "--score", "data.csv", "--select", "incidence=50", "plane=60"]) == 0
+    assert {"selected: azimuth=0", "held out: incidence=50"} <= set(data.source.notes)
+    assert main(["predict", "result", "--score", "data.csv", "--select", "incidence=50", "azimuth=60"]) == 0
     assert "Prediction of data.csv" in capsys.readouterr().out
 
 
@@ -170,17 +165,15 @@ def test_info_says_what_is_there_and_draws_it(work, capsys, monkeypatch):
     assert (work / "data.png").read_bytes() == b"precious"
 
     names = ",".join(f"brdf_{k}" for k in range(400))
-    rows = [f"30,{theta}," + ",".join(map(str, np.linspace(1.0, 2.0, 400))) for theta in range(-60, 61, 10)]
+    rows = [f"30,{theta}," + ",".join(["1"] * 399 + ["2"]) for theta in range(-60, 61, 10)]
     (work / "spectral.csv").write_text("\n".join([f"theta_i,theta_o,{names}", *rows]))
-    capsys.readouterr()
     assert main(["info", "spectral.csv"]) == 0
     output = capsys.readouterr().out
     assert "0, 1, 2, ..., 399 (400 in all)" in output
     assert "1 to 2" in output
-    assert len(data_picture(read("spectral.csv")).subfigs[0].axes) == MOST_CHANNELS
 
 
-def test_convert_and_simulate_write_csv(work, capsys, coat_data):
+def test_convert_and_simulate_write_csv(work, coat_data):
     assert main(["convert", "data.csv", "copy.csv"]) == 0
     np.testing.assert_array_equal(read(work / "copy.csv").values, coat_data.values)
     words = ["simulate", "--stack", "coat.toml", "--incidence", "20", "40", "--noise", "0.1", "--out", "new.csv"]
@@ -190,52 +183,26 @@ def test_convert_and_simulate_write_csv(work, capsys, coat_data):
     # Lambertian paint alone would be albedo / pi = 0.159; the coat's start values darken it
     assert 0.02 < float(np.median(first.values)) < 0.16
 
-    more = "\n[noise]\nrelative = 0.1\n[instrument]\ndetector_aperture = 2.0\n"
-    (work / "noisy.toml").write_text((work / "coat.toml").read_text() + more)
-    for name in ("coat", "noisy"):
-        assert main(["simulate", "--stack", f"{name}.toml", "--out", f"{name}.csv"]) == 0
-    assert capsys.readouterr().out.splitlines()[-1] == "Not simulated: [noise], [instrument] of noisy.toml"
-    np.testing.assert_array_equal(read("noisy.csv").values, read("coat.csv").values)
-    assert "not simulated: [noise], [instrument] of noisy.toml" in read("noisy.csv").source.notes
-
 
 # ---- the command itself ----
 
 
-def test_help_imports_no_jax():
-    script = "import sys; from fits.cli import main\ntry: main(['--help'])\nfinally: assert 'jax' not in sys.modules"
-    done = subprocess.run([sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    assert "simulate" in done.stdout
+HELP = """
+import contextlib, sys
+from fits.cli import main
+from fits.cli.arguments import COMMANDS
+for words in ([], *([name] for name in COMMANDS)):
+    with contextlib.suppress(SystemExit):
+        main([*words, "--help"])
+assert "jax" not in sys.modules
+"""
 
 
-@pytest.mark.parametrize("command", COMMANDS)
-def test_every_command_has_its_help(command: str, capsys: pytest.CaptureFixture[str]) -> None:
-    """Eleven of them had a traceback instead."""
-    with pytest.raises(SystemExit) as stop:
-        main([command, "--help"])
-    assert stop.value.code == 0
-    words, one = capsys.readouterr().out, COMMANDS[command]
-    assert all(option in words for option in (*one.particular, *one.shared.split()) if option.startswith("--"))
-
-
-def test_an_interrupt_that_a_callback_drops_comes_again() -> None:
-    def dropped(phase: str, info: dict[str, int]) -> None:
-        gc.callbacks.remove(dropped)
-        raise KeyboardInterrupt
-
-    def collect_and_wait():
-        gc.callbacks.append(dropped)
-        with raised_again():
-            gc.collect()
-            time.sleep(30)
-
-    ours = signal.signal(signal.SIGINT, signal.default_int_handler)
-    try:
-        with pytest.raises(KeyboardInterrupt):
-            collect_and_wait()
-    finally:
-        signal.signal(signal.SIGINT, ours)
+def test_every_command_has_its_help_without_jax() -> None:
+    done = subprocess.run([sys.executable, "-c", HELP], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+    flags = [flag for one in COMMANDS.values() for flag in (*one.particular, *one.shared.split())]
+    assert all(flag in done.stdout for flag in flags)
 
 
 def test_a_warning_for_users_is_one_line_and_shown_once(capsys, monkeypatch):
@@ -271,25 +238,9 @@ def test_a_fit_of_angles_in_radians_is_doubted(
     assert "layerjax: warning: Angles: none is above 0.5°: are they radians?" in capsys.readouterr().err
 
 
-SLOW = """
-import sys
-import numpy as np
-from fits.cli.input_output import use_jax
-
-assert "jax" not in sys.modules, "XLA reads what it may print as it is loaded"
-use_jax()
-import jax
-
-image, kernel = np.random.rand(1, 1, 170, 170), np.random.rand(4, 1, 21, 21)
-folded = lambda x: x + jax.lax.conv_general_dilated(image, kernel, (1, 1), "SAME").sum()
-jax.jit(folded).lower(1.0).compile()
-"""
-"""A constant that XLA folds for more than a second, of which it raises the alarm that it raises of slow programs."""
-
-
-def test_alarms_of_the_compiler_are_not_shown(tmp_path):
-    environment = {name: word for name, word in os.environ.items() if name not in ("TF_CPP_MIN_LOG_LEVEL", "XLA_FLAGS")}
-    environment["JAX_COMPILATION_CACHE_DIR"] = str(tmp_path)  # nothing is compiled yet
-    run = subprocess.run([sys.executable, "-c", SLOW], capture_output=True, text=True, env=environment, check=False)
-    assert run.returncode == 0, run.stderr
-    assert run.stderr == ""
+def test_alarms_of_the_compiler_are_not_shown():
+    """XLA reads what it may print as it is loaded: it is told before."""
+    script = "import os, sys; from fits.cli.input_output import use_jax; assert 'jax' not in sys.modules; use_jax(); "
+    script += "assert os.environ['TF_CPP_MIN_LOG_LEVEL'] == '3'"
+    environment = {name: word for name, word in os.environ.items() if name != "TF_CPP_MIN_LOG_LEVEL"}
+    subprocess.run([sys.executable, "-c", script], env=environment, check=True)

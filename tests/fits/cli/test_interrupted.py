@@ -1,8 +1,9 @@
 """Commands that are interrupted or killed, full disks, and processes that meet: what was kept stays, and is resumed."""
 
 import signal
+import subprocess
 import sys
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import numpy as np
@@ -68,10 +69,9 @@ def test_an_interrupt_says_how_to_resume(work, capsys, coat_fit, monkeypatch, pl
     [
         (["convert", "data.csv", "out.csv", "--force"], "out.csv"),
         (["simulate", "--stack", "coat.toml", "--out", "out.csv", "--force"], "out.csv"),
-        (["render", "coat.toml", "--size", "16", "--out", "out.png", "--force"], "out.png"),
+        (["render", "coat.toml", "--out", "out.png", "--force"], "out.png"),
         (["info", "data.csv", "--out", "out.png", "--force"], "out.png"),
-        (["compare", "one", "two", "--no-refit", "--out", "out.html", "--force"], "out.html"),
-        (["report", "one"], "one"),
+        (["report", "one"], "one/report.html"),
         (["sample", "one"], "one/chain.db"),
     ],
     ids=lambda value: value[0] if isinstance(value, list) else "",
@@ -81,7 +81,7 @@ def test_a_full_disk_is_one_line_and_changes_nothing(work, capsys, coat_fit, wor
     monkeypatch.setattr("fits.reports.render.render", lambda *_, **__: data_picture(coat_fit.problem.data))
     for directory in ("one", "two"):
         save_fit(coat_fit, directory)
-    for output in ("out.csv", "out.png", "out.html", "one/report.html"):
+    for output in ("out.csv", "out.png", "one/report.html"):
         (work / output).write_text("precious")
     before = contents(work)
     with largest_file(6_000):
@@ -101,13 +101,14 @@ def test_a_full_disk_behind_stdout_is_one_line(work, capsys, monkeypatch):
         assert "No space left on device" in refusal(["convert", "data.csv", "out.csv"], capsys)
 
 
-def test_the_report_of_a_result_that_can_only_be_read_goes_elsewhere(work, capsys, coat_fit):
+def test_the_report_of_a_result_that_can_only_be_read_goes_elsewhere(work, capsys, coat_fit, monkeypatch):
+    monkeypatch.setattr(FitReport, "page", lambda _: "drawn")
     save_fit(coat_fit, "result")
     with read_only(work / "result"):
         assert "(--out FILE writes the report elsewhere)" in refusal(["report", "result"], capsys)
         assert main(["report", "result", "--out", "report.html"]) == 0
         assert "chain.db.lock: " in refusal(["sample", "result"], capsys)
-    assert "</html>" in (work / "report.html").read_text()
+    assert (work / "report.html").read_text() == "drawn"
     assert "--force" in refusal(["report", "result", "--out", "report.html"], capsys)
 
 
@@ -116,7 +117,7 @@ def test_a_fit_on_a_full_disk_keeps_its_starts_and_the_earlier_result(work, caps
     before = contents(work)
     words = [*FIT, "--starts", "3", "--force"]
     with largest_file(30_000):
-        assert refusal(words, capsys) == "layerjax: error: result: file too large"
+        assert refusal(words, capsys) == "layerjax: error: result/report.html: file too large"
     after = contents(work)
     after.pop(str(work / ".result.starts"))
     assert len(Store.read(".result.starts").keys()) == 3
@@ -161,9 +162,13 @@ def test_an_interrupted_fit_exits_with_130_and_the_next_resumes_with_the_starts_
         before = contents(work)
         assert f"result is in use by another process ({process.pid})" in refusal(MANY_STARTS, capsys)
         assert contents(work) == before
-        process.send_signal(signal.SIGINT)
         process.send_signal(signal.SIGCONT)
-        _, error = process.communicate(timeout=60)
+        error = ""
+        for _ in range(10):  # Python drops one that comes in a callback of the garbage collector
+            process.send_signal(signal.SIGINT)
+            with suppress(subprocess.TimeoutExpired):
+                _, error = process.communicate(timeout=6)
+                break
     assert process.returncode == 130
     words = "result was not written; the same command resumes with the starts that are done"
     assert error.splitlines()[-1] == f"layerjax: interrupted: {words}"

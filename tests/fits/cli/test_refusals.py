@@ -1,9 +1,9 @@
 """Bad input and bad usage of `layerjax`: one line on stderr, exit code 2, and nothing written."""
 
 import shutil
+from unittest.mock import Mock
 
 import jax
-import numpy as np
 import pytest
 
 from fits.cli.commands import COMMANDS
@@ -13,19 +13,15 @@ from tests.helpers.commands import refused
 from tests.helpers.files import contents
 
 FIT = "fit data.csv --stack coat.toml --out result"
-PREDICT = "predict saved --incidence 30 --out new.csv"
 
 REFUSALS = (
     ("info nowhere.csv", "nowhere.csv"),
-    ("info short.binary", "short.binary"),
     ("info data.csv --out coat.toml", "--force"),
-    ("info data.csv --read format=mrel", "format is 'mrel'; it must be one of csv, "),
+    ("info data.csv --read format=mrel", "format is 'mrel', must be one of csv, "),
     ("info data.csv --read csv", "'csv' is no option of a reader; it must be format=..., quantity=..., bins=..."),
     ("info data.csv --read format=csv format=csv", "format is given twice"),
-    ("info data.csv --read bins=0", "bins is '0'; it must be a number of at least 1, or all"),
-    ("info data.csv --read corrected=maybe", "corrected is 'maybe'; it must be yes or no"),
+    ("info data.csv --read corrected=maybe", "wavelengths and corrected apply to rxt files only"),
     ("info bad.csv", "bad.csv, line 2, column 'theta_o': 'twenty'"),
-    ("fit bad.csv --stack coat.toml --out result", "bad.csv, line 2"),
     ("fit data.csv --stack bad.toml --out result", "bad.toml: layers[0] has an unknown key 'thicknes'"),
     ("fit data.csv --stack nowhere.toml --out result", "nowhere.toml"),
     ("fit data.csv --stack rough.toml --out result", "Interface"),
@@ -35,23 +31,20 @@ REFUSALS = (
     (f"{FIT} --hold-out incidence=30", "incidence 30 is not in the data; there are 10, 50 degrees"),
     (f"{FIT} --hold-out incidence=10,50", "--select and --hold-out leave nothing to fit"),
     (f"{FIT} --select incidence=10 --hold-out incidence=50", "--hold-out leaves nothing to score"),
-    (f"{FIT} --hold-out channel=value", "the parameters of a channel cannot be predicted from others"),
-    (f"{FIT} --select channel=blue", "channel blue is not in the data; there are"),
-    ("fit data.csv --stack root.toml --out result --hold-out share=0.2", "--hold-out needs the objective 'likelihood'"),
+    (f"{FIT} --hold-out channels=value", "the parameters of a channel cannot be predicted from others"),
+    (f"{FIT} --select channels=blue", "channel blue is not in the data; there are"),
+    ("fit data.csv --stack root.toml --out result --hold-out incidence=10", "needs the objective 'likelihood'"),
     ("convert data.csv data.bsdf", ".csv"),
     ("simulate --stack coat.toml --out data.csv", "--force"),
     ("simulate --stack coat.toml --incidence 20,95.5 --out new.csv", "a light at 95.5 degrees sees nothing"),
     ("sample .", "fit.json"),
     ("report nowhere", "nowhere"),
     ("compare .", "two or more"),
-    ("predict saved", "predict needs one of --incidence and --score"),
     ("predict saved --incidence 30 --score data.csv", "predict needs one of --incidence and --score"),
     ("predict saved --incidence 30", "predict --incidence needs --out FILE"),
     ("predict saved --incidence 30 --out new.txt", ".csv"),
-    (f"{PREDICT} --select plane=0", "--select is given without --score"),
-    (f"{PREDICT} --read bins=all", "--read is given without --score"),
+    ("predict saved --incidence 30 --out new.csv --select azimuth=0", "--select is given without --score"),
     ("predict saved --score data.csv --azimuth 90", "--azimuth is given without --incidence"),
-    ("render fabric --out a.png --size 100000", "size is 100000, must be in [16, 1024]"),
     ("render fabrik --out a.png", "neither a .toml file nor a material of the gallery: window_shade"),
     ("render fabric --out a.jpg", "pictures can be written as .png only"),
     ("fit-many scans", "no stack is given"),
@@ -63,7 +56,6 @@ REFUSALS = (
 def test_refusals(work, capsys, coat_fit, command, fragment):
     (work / "bad.csv").write_text("theta_i,phi_i,theta_o,phi_o,brdf\n10,180,twenty,0,0.1\n")
     (work / "bad.toml").write_text((work / "coat.toml").read_text().replace("thickness", "thicknes"))
-    (work / "short.binary").write_bytes(np.array([90, 90, 180], "<i4").tobytes() + b"\0" * 1000)
     interface = '[[layers]]\nkind = "Interface"\nior = { start = 1.5, low = 1.2, high = 2.0 }\nalpha = 0.1\n'
     (work / "rough.toml").write_text('transport = "SingleScattering"\n' + interface)
     (work / "root.toml").write_text('objective = "cube_root"\n' + (work / "coat.toml").read_text())
@@ -94,9 +86,7 @@ MAP, MANY = "fit-map map.npy --stack coat.toml --out coat.zarr", "fit-many scans
         ("simulate --stack coat.toml --out x.csv --noise -1", "-1 given, must be a number in [0, 1]"),
         (f"{MANY} --processes 2 --scheduler tcp://x:1", "--scheduler: not allowed with argument --processes"),
         (f"{MAP} --spatial-prior wide", "invalid choice: 'wide'"),
-        (f"{MAP} --spatial-prior gaussian --spatial-scale scale=x", "'x' given, must be a number >= 0"),
-        (f"{MAP} --chunk-size -1", "must be a whole number >= 1"),
-        (f"{MAP} --emulator maybe", "invalid choice: 'maybe'"),
+        (f"{MAP} --spatial-scale x", "'x' given, must be a number >= 0"),
     ],
 )
 def test_bad_usage(work, capsys, command, fragment):
@@ -120,23 +110,19 @@ def test_a_cluster_that_is_not_there_is_named(work, capsys):
     assert "tcp://127.0.0.1:9: there is no scheduler" in capsys.readouterr().err.splitlines()[-1]
 
 
-MACHINE = {
-    "memory": (MemoryError("Unable to allocate 74.5 GiB"), "memory is not enough: Unable to allocate 74.5 GiB"),
-    "memory without a message": (MemoryError(), "memory is not enough: MemoryError"),
-    "JAX's memory": (
-        jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory\nallocating 9 bytes."),
-        "memory is not enough: RESOURCE_EXHAUSTED: Out of memory allocating 9 bytes.",
-    ),
-    "size": (OverflowError("cannot convert float infinity to integer"), "a number is too large: cannot convert"),
-}
-
-
-@pytest.mark.parametrize(("error", "fragment"), MACHINE.values(), ids=MACHINE)
+@pytest.mark.parametrize(
+    ("error", "fragment"),
+    [
+        (MemoryError(), "memory is not enough: MemoryError"),
+        (
+            jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of\nmemory"),
+            "not enough: RESOURCE_EXHAUSTED: Out of memory",
+        ),
+        (OverflowError("cannot convert float infinity to integer"), "a number is too large: cannot convert"),
+    ],
+)
 def test_errors_of_the_machine(work, capsys, monkeypatch, error, fragment):
-    def fails(_):
-        raise error
-
-    monkeypatch.setitem(COMMANDS, "info", fails)
+    monkeypatch.setitem(COMMANDS, "info", Mock(side_effect=error))
     assert fragment in refused(["info", "data.csv"], capsys, work)
 
 

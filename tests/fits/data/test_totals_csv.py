@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fits.data.formats import totals_csv, write_csv
+from fits.data.formats import write_csv
 from fits.data.geometry import direction
 from fits.data.reading import read
 from fits.data.totals import Totals
@@ -22,7 +22,6 @@ def test_every_cell_is_a_reading(reading):
     np.testing.assert_allclose(found.theta_i, [0.0, 60.0, 0.0], atol=1e-9)
     assert found.wo[:, 2].tolist() == pytest.approx([1.0, 0.5, -1.0])
     assert found.source.notes == ("columns not used: operator",)
-    assert "1.2 together" in reading(f"{HEADER}\n0,0.7,0.01,0.5,0.02\n").source.notes[0]  # more than all the light
 
 
 @pytest.mark.parametrize("missing", ["", "nan", "NA"])
@@ -31,14 +30,6 @@ def test_rows_without_any_value_are_counted(reading, missing):
     found = reading(f"{head}0,0.3,0.5\n10,{missing},{missing}\n20,0.3,{missing}\n30,{missing},{missing}\n")
     np.testing.assert_allclose(found.values[:, 0], [0.3, 0.3, 0.5])
     assert found.source.notes == ("skipped: 2 rows without a value (an empty cell, or nan)",)
-
-
-def test_more_than_all_the_light_is_noted_of_a_file_and_warned_of_by_hand(reading):
-    said = "reflectance at 0 degrees, value, is 1.3: more than 1 by more than 3 standard deviations"
-    found = reading("theta_i,total_reflectance,total_reflectance_std\n0,1.3,0.01\n")
-    assert any(said in note for note in found.source.notes)
-    with pytest.warns(UserWarning, match=said):
-        Totals.of(0.0, reflectance=1.3, sigma=0.01)
 
 
 def test_channels_and_unscattered_light(reading):
@@ -51,7 +42,7 @@ def test_channels_and_unscattered_light(reading):
 def test_readings_that_were_repeated_come_back(reading, tmp_path):
     names = "theta_i,total_reflectance,total_reflectance_std,unscattered_transmittance,unscattered_transmittance_std"
     found = reading(f"{names}\n0,0.3,0.01,0.2,0.01\n0,0.31,0.02,,\n30,0.4,0.01,0.1,0.01\n")
-    totals_csv.write(found, tmp_path / "again.csv")
+    write_csv(found, tmp_path / "again.csv")
     again = read(tmp_path / "again.csv")
     assert again.kinds == found.kinds == ("reflectance",) * 3 + ("unscattered",) * 2
     for name in ("theta_i", "values", "sigma"):
@@ -67,7 +58,5 @@ def test_a_bsdf_beside_a_column_of_totals_is_a_bsdf(reading):
 def test_what_would_not_come_back_is_not_written(tmp_path):
     turned = replace(Totals.of([30, 30], reflectance=0.3), wi=direction(30, [180, 90]))
     with pytest.raises(ValueError, match="several azimuths at 30 degrees"):
-        totals_csv.write(turned, tmp_path / "new.csv")
-    with pytest.raises(ValueError, match="totals are no BSDF values"):
-        write_csv(Totals.of(reflectance=0.3), tmp_path / "new.csv")
+        write_csv(turned, tmp_path / "new.csv")
     assert not list(tmp_path.iterdir())

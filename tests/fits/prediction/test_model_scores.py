@@ -17,8 +17,6 @@ from fits.prediction.compare import compare
 from fits.prediction.cross_validation import (
     CrossValidation,
     cross_validate,
-    groups_of,
-    model_scores,
     rank_models,
     stacking,
     without,
@@ -118,21 +116,13 @@ def test_held_out_data_of_a_ridge_are_predicted(known: bool, monkeypatch: pytest
         np.testing.assert_allclose(left.log_density[rows, 0], expected, atol=0.05)
 
 
-def test_few_incidences_are_held_out_by_parts_of_scans() -> None:
-    one = DATA.where(np.abs(DATA.theta_i - 10.0) < 1.0).used()
-    groups = groups_of(one)
-    assert sorted(np.concatenate(list(groups.values()))) == list(range(len(one)))
-    assert len(groups) == 5
-    for rows in groups.values():
-        assert np.ptp(one.theta_o[rows] * np.sign(one.wo[rows, 0])) < 40.0
-
-
 def test_measurements_in_no_group_do_not_count() -> None:
     """One scan at one incidence, and three measurements in another plane, too few to hold some out."""
     scan, wo = np.abs(DATA.theta_i - 10.0) < 1.0, DATA.wo.copy()
     aside = np.flatnonzero(scan)[:3]
     wo[aside] = wo[aside][:, [1, 0, 2]]
     left = cross_validate(fitted(STACK, replace(DATA, wo=wo).where(scan)))
+    assert len(left.groups) == 5  # parts of the scan: one incidence says nothing of others
     alone = np.setdiff1d(np.arange(scan.sum()), np.concatenate(left.rows))
     assert alone.size == 3
     assert np.all(left.log_density[alone] == 0.0)
@@ -152,6 +142,38 @@ def test_evidence_is_that_of_regression(found: Fit, flat: Fit) -> None:
         assert got.log_evidence == pytest.approx(law.logpdf(DATA.values[:, 0]), abs=5.0 * got.error)
 
 
+def product(stack, wi, wo):
+    return (stack["a"] * stack["b"] + 0.0 * wo[:, 2])[:, None]
+
+
+@pytest.mark.parametrize(
+    ("transport", "free", "truth"),
+    [
+        (product, {"a": Free(1.0, 0.1, 5.0), "b": Free(1.0, 0.1, 5.0)}, {"a": 1.0, "b": 0.8}),  # a hyperbola
+        (line, {"a": Free(0.5, 0.0, 1.0), "b": Free(0.1, -1.0, 3.0)}, {"a": 1.02, "b": 0.5}),  # beyond a bound
+        (product, {"a": Free(0.1, 0.0, 1.0), "b": Free(0.1, 0.0, 1.0)}, {"a": 0.0, "b": 0.0}),  # nothing is known
+    ],
+)
+def test_evidence_is_the_integral_over_the_box(transport: Any, free: dict[str, Free], truth: dict[str, float]) -> None:
+    """Of posteriors that are no ellipsoids, beside quadrature; the noise is so large that the box matters."""
+    at, sigma, count = slices([10.0, 50.0], np.arange(-75.0, 76.0, 10.0)), 0.1, 1500
+    exact = np.asarray(transport(truth, at.wi, at.wo))
+    data = along(at, exact + sigma * np.random.default_rng(0).standard_normal(exact.shape), sigma)
+    one = fit(free, data, transport=transport, noise=Noise(discrepancy=False), starts=2)
+    sides = [np.linspace(low, high, count + 1) for low, high in zip(one.problem.low, one.problem.high, strict=True)]
+    a, b = np.meshgrid(*(0.5 * (side[1:] + side[:-1]) for side in sides), indexing="ij")
+    # both are linear in two numbers: squares of the residuals by their moments
+    y = data.values[:, 0]
+    first, second, x = (a, b, at.wo[:, 2]) if transport is line else (0.0, a * b, np.ones(len(at)))
+    squares = y @ y - 2.0 * first * y.sum() - 2.0 * second * (x @ y)
+    squares = squares + first**2 * x.size + 2.0 * first * second * x.sum() + second**2 * (x @ x)
+    logs = -0.5 * squares / sigma**2 - y.size * np.log(sigma * np.sqrt(2.0 * np.pi))
+    estimate = evidence(one)
+    assert estimate.reliable
+    assert abs(estimate.log_evidence - float(logsumexp(logs) - 2.0 * np.log(count))) < 4.0 * estimate.error
+    assert estimate.error < 0.1
+
+
 def test_weights_of_stacking_are_the_best() -> None:
     generator = np.random.default_rng(0)
     densities = generator.standard_normal((3, 200)) + np.array([[0.3], [0.2], [-5.0]])
@@ -166,38 +188,29 @@ def test_weights_of_stacking_are_the_best() -> None:
     np.testing.assert_allclose(stacking(np.array([[0.0, 0.0], [-50.0, -50.0]])), [1.0, 0.0], atol=1e-6)
 
 
-def test_fits_are_ranked_by_elpd(found: Fit, flat: Fit) -> None:
-    compared = compare({"flat": flat, "line": found}, refit=True)
-    assert compared.sorted_by == "elpd"
-    best, other = compared.rows
-    assert (best.name, other.name) == ("line", "flat")
-    assert best.model_score.elpd_diff == 0.0
-    assert other.model_score.elpd_diff == pytest.approx(best.model_score.elpd - other.model_score.elpd)
-    assert best.model_score.weight + other.model_score.weight == pytest.approx(1.0)
-    odds = np.exp(best.model_score.evidence.log_evidence - other.model_score.evidence.log_evidence)
-    assert best.model_score.model_probability / other.model_score.model_probability == pytest.approx(odds)
+def test_fits_are_ranked_by_elpd_and_averaged_by_stacking(found: Fit, flat: Fit) -> None:
+    candidates = {"flat": flat, "line": found}
+    compared = compare(candidates, refit=True)
+    best, other = (row.model_score for row in compared.rows)
+    assert (compared.sorted_by, [row.name for row in compared.rows]) == ("elpd", ["line", "flat"])
+    assert best.elpd_diff == 0.0
+    assert other.elpd_diff == pytest.approx(best.elpd - other.elpd)
+    odds = np.exp(best.evidence.log_evidence - other.evidence.log_evidence)
+    assert best.model_probability / other.model_probability == pytest.approx(odds)
     assert "by cross-validation" in compared.verdict[0]
     table = tables.comparison_table(compared)
     assert {"elpd", "weight", "log evidence", "model probability"} <= set(table.columns)
+    stacked = average(candidates)
+    assert stacked.weights == pytest.approx({row.name: row.model_score.weight for row in compared.rows})
+    assert predict(stacked, DATA).scores.count == DATA.values.size
 
 
 def test_averages_are_mixtures(found: Fit, flat: Fit) -> None:
-    candidates, at = {"line": found, "flat": flat}, DATA
-    alone = predict(average(candidates, {"line": 1.0, "flat": 0.0}), at, draws=1000)
-    one = predict(found, at, draws=1000)
-    np.testing.assert_allclose(alone.predictive.mean, one.predictive.mean, atol=0.01)
-    np.testing.assert_allclose(alone.log_density(at.values), one.log_density(at.values), atol=1e-6)
-    both = predict(average(candidates, {"line": 3.0, "flat": 1.0}), at, draws=4000)
-    parts = [np.exp(predict(of, at, draws=2000).log_density(at.values)) for of in (found, flat)]
-    np.testing.assert_allclose(both.log_density(at.values), np.log(0.75 * parts[0] + 0.25 * parts[1]), atol=0.05)
+    both = predict(average({"line": found, "flat": flat}, {"line": 3.0, "flat": 1.0}), DATA, draws=4000)
+    parts = [np.exp(predict(of, DATA, draws=2000).log_density(DATA.values)) for of in (found, flat)]
+    np.testing.assert_allclose(both.log_density(DATA.values), np.log(0.75 * parts[0] + 0.25 * parts[1]), atol=0.05)
     many = {f"{number}": found for number in range(9)}  # more than draws: of those that are drawn at all, two
-    both = predict(average(many, dict.fromkeys(many, 1.0)), at, draws=4)
-    assert len(both.values) == 4 * 2
-    np.testing.assert_allclose(both.mean, found.predicted, atol=5.0 * SIGMA)
-    both = average(candidates)  # by stacking
-    weights = {name: seen.weight for name, seen in model_scores(candidates).items()}
-    assert both.weights == pytest.approx(weights)
-    assert predict(both, at).scores.count == at.values.size
+    assert len(predict(average(many, dict.fromkeys(many, 1.0)), DATA, draws=4).values) == 4 * 2
 
 
 def test_bad_requests_are_refused(found: Fit, flat: Fit) -> None:

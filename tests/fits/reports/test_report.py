@@ -1,87 +1,31 @@
 """The report says what was fitted and how far to trust it; its pictures show what is there."""
 
+import io
 import re
+from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
-from scipy.signal import lfilter
 
 import layerjax as lj
 from fits.any_report import report
-from fits.data.geometry import Geometry, direction, slices
+from fits.data.geometry import slices
 from fits.data.measurements import Measurements, Source
-from fits.data.scans import correlation, in_plane, incidences, neighbours, relative_azimuth, signed_angle
+from fits.data.scans import in_plane, signed_angle
 from fits.optimise.fit import fit
 from fits.optimise.result import Fit
 from fits.problem.noise import Noise
 from fits.problem.parameters import Free
 from fits.reports import tables
-from fits.reports.diagnostics import standardised
 from fits.reports.html import FitReport
 from fits.reports.plots import data as pictures
 from fits.reports.plots import model as model_pictures
-from fits.reports.verdicts import assess
+from fits.reports.tables import Table, degrees, print_table, with_error
+from fits.reports.verdicts import standardised
 from tests.helpers.models import along
-
-
-def measurements(theta_i, phi_i, theta_o, phi_o) -> Measurements:
-    angles = np.broadcast_arrays(theta_i, phi_i, theta_o, phi_o)
-    return along(Geometry(direction(*angles[:2]), direction(*angles[2:])))
-
-
-def test_the_viewing_angle_is_positive_on_the_mirror_side() -> None:
-    data = measurements(30.0, [180, 180, 37, 300, 180, 180], 20.0, [0, 180, 217, 120, 60, 120])
-    np.testing.assert_allclose(signed_angle(data), [20, -20, 20, 20, 20, -20], atol=1e-9)
-    np.testing.assert_allclose(relative_azimuth(data), [0, 180, 0, 0, 60, 120], atol=1e-9)
-    np.testing.assert_array_equal(in_plane(data), [True, True, True, True, False, False])
-    normal = slices(incidence=0.0, outgoing=(-40.0, 0.0, 40.0))  # its planes are those of the slices
-    np.testing.assert_allclose(signed_angle(normal), [-40, 0, 40], atol=1e-9)
-    assert in_plane(normal).all()
-
-
-ANGLES = [10.0, 30.0, 10.0, 30.0, 10.0], [180.0, 180.0, 0.0, 180.0, 180.0]
-JITTERED = [30.24, 30.26, 30.3, 30.74, 0.1, 0.2, 50.0, 50.0], [359.9, 0.1, 0.0, 0.0, 10.0, 200.0, 90.0, 90.6]
-
-
-def test_rows_of_one_incidence() -> None:
-    """Incidences differ by either angle, and are the same within the jitter of an instrument."""
-    for (theta, phi), groups in (
-        (ANGLES, [(10.0, 0.0, [2]), (10.0, 180.0, [0, 4]), (30.0, 180.0, [1, 3])]),
-        (JITTERED, [(0.15, None, [4, 5]), (30.27, 0.0, [0, 1, 2]), (30.74, 0.0, [3]), (50.0, 90.0, [6]),
-                    (50.0, 90.6, [7])]),
-    ):  # fmt: skip
-        for group, (polar, azimuth, rows) in zip(incidences(measurements(theta, phi, 5.0, 0.0)), groups, strict=True):
-            assert group.rows.tolist() == rows
-            assert group.theta == pytest.approx(polar, abs=0.005)
-            assert azimuth is None or group.phi == pytest.approx(azimuth, abs=0.005)
-
-
-def series(correlation: float, count: int, seed: int) -> np.ndarray:
-    """A stationary autoregressive series of unit variance."""
-    draws = np.random.default_rng(seed).standard_normal(count) * np.sqrt(1 - correlation**2)
-    draws[0] /= np.sqrt(1 - correlation**2)
-    return lfilter([1.0], [1.0, -correlation], draws)
-
-
-@pytest.mark.parametrize("given", [0.0, 0.8])
-def test_the_correlation_of_neighbours_is_recovered(given: float) -> None:
-    count = 4000
-    shuffled, angle = np.random.default_rng(0).permutation(count), np.linspace(-80, 80, count)
-    data = measurements(30.0, 180.0, np.abs(angle), np.where(angle < 0, 180.0, 0.0))
-    pairs = neighbours(replace(data, wo=data.wo[shuffled]), series(given, count, seed=5)[shuffled, None])
-    # the standard error of a lag-one correlation r is sqrt((1 - r^2) / n)
-    assert abs(correlation(*pairs) - given) < 4 * np.sqrt((1 - given**2) / count)
-    assert pairs[0].size == count - 1
-
-
-def test_errors_are_too_small_by_what_the_mean_of_a_correlated_series_says(coat_fit: Fit) -> None:
-    means = [series(0.6, 400, seed).mean() for seed in range(1500)]
-    facts = replace(assess(coat_fit), lag_one=0.6)
-    # 1500 means give their variance to sqrt(2 / 1500) = 4 %
-    assert facts.error_factors == (1.0, pytest.approx(np.sqrt(400 * np.var(means)), rel=0.06))
 
 
 def test_masked_rows_have_no_residual(coat_fit: Fit) -> None:
@@ -106,7 +50,7 @@ def test_the_report_holds_everything(coat_fit: Fit, tmp_path: Path) -> None:
         assert word in text, word
     assert "<coat>" not in text
     pictured = re.findall(r'src="([^"]{30})', text)
-    assert len(pictured) == 5  # curves, maps, residuals, correlation, comparison
+    assert len(pictured) == 4  # curves, maps, correlation, comparison
     assert all(start.startswith("data:image/png;base64,") for start in pictured)
     assert "http" not in re.sub(r"base64,[^\"]*", "", text)
     with pytest.raises(ValueError, match="exists"):  # it replaces an earlier one only by force
@@ -114,16 +58,60 @@ def test_the_report_holds_everything(coat_fit: Fit, tmp_path: Path) -> None:
     assert path.read_text() == text
 
 
-def test_the_report_begins_with_the_verdict_and_lists_the_incidences_that_were_fitted(coat_fit: Fit) -> None:
+def test_the_report_begins_with_the_verdict_and_lists_the_incidences_that_were_fitted(
+    coat_fit: Fit, monkeypatch: pytest.MonkeyPatch
+) -> None:
     data = coat_fit.problem.data
     kept = data.where(np.isclose(data.theta_i, 10.0), "held out: incidence=50")
     part = FitReport(replace(coat_fit, problem=replace(coat_fit.problem, data=kept)))
-    vars(part)["images"] = {}  # none is drawn
+    monkeypatch.setattr("fits.reports.html.image", lambda *_: "")
     text = part.page()
     assert "<td>incidence</td><td>10°</td>" in text
     heads = re.findall("<h2>(.*?)</h2>", text)
     assert heads == ["Values", "Data and model", "Diagnostics", "Identifiability", "Posterior"]
     assert text.index('class="verdict') < text.index("<h2>")
+
+
+# ---- tables ----
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+def printed(table: Table, width: int, patch: pytest.MonkeyPatch) -> str:
+    """What a terminal of that width shows, without its colours."""
+    for name, value in {"COLUMNS": str(width), "LINES": "50", "TERM": "xterm"}.items():
+        patch.setenv(name, value)
+    terminal = Terminal()
+    print_table(table, terminal)
+    return re.sub(r"\x1b\[[0-9;]*m", "", terminal.getvalue())
+
+
+def test_numbers_in_words() -> None:
+    """Degrees to two decimals at most, values to two digits of their error."""
+    angles = {89.8511: "89.85°", 30.0: "30°", -1e-9: "0°", 55.5: "55.5°", 359.996: "360°"}
+    assert [degrees(angle) for angle in angles] == list(angles.values())
+    values = {
+        (0.53217, 0.0214): ("0.532", "0.021"),
+        (1234.567, 12.0): ("1235", "12"),
+        (0.5, float("nan")): ("0.5", "unknown"),
+        (1e-7, 2.5e-9): ("1e-07", "2.5e-09"),
+        (123456.0, 34567.0): ("123456", "34567"),
+    }
+    assert [with_error(*pair) for pair in values] == list(values.values())
+
+
+@pytest.mark.parametrize("width", [40, 80, 200])
+def test_what_is_too_wide_is_folded_and_never_cut(width: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    rows = tuple(
+        (f"layers[{k}].thickness", f"{1.23456 * 10**k:.4f}", "weakly identified, direction 1") for k in range(3)
+    )
+    text = printed(Table("Fit", ("parameter", "value", "identifiability"), rows), width, monkeypatch)
+    assert max(map(len, text.splitlines())) <= width
+    assert "…" not in text
+    assert Counter("".join("".join(row).replace(" ", "") for row in rows)) <= Counter(text)
 
 
 # ---- pictures ----

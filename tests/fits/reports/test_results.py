@@ -59,24 +59,17 @@ def unfitted(coat_fit: Fit, **settings: Any) -> Fit:
             "scale": Free(1.0, 0.8, 1.25, LogNormal(1.0, 0.05)),
             "noise": Noise(relative=0.02, floor=1e-4, use_sigma=False, tails="student", degrees_of_freedom=5.0),
         },
-        {"scale": 1.1, "objective": "cube_root"},
-        {"transport": lj.SingleScattering(), "noise": Noise(relative=Free(0.05, 0.01, 0.5))},
+        {"scale": 1.1, "objective": "cube_root", "transport": lj.SingleScattering()},
     ],
 )
 def test_a_saved_fit_comes_back(coat_fit: Fit, tmp_path: Path, settings: dict[str, Any] | None) -> None:
     fit = coat_fit if settings is None else unfitted(coat_fit, **settings)
+    fit = replace(fit, condition_number=np.inf)  # a word in JSON
     save_fit(fit, tmp_path / "result")
     loaded = load_fit(tmp_path / "result")
     assert_same(loaded, fit)
     for name in ("scale", "noise", "objective", "transport"):
         assert getattr(loaded.problem, name) == getattr(fit.problem, name), name
-
-
-def test_numbers_that_are_not_finite_are_strings_in_json(coat_fit: Fit, tmp_path: Path) -> None:
-    odd = replace(coat_fit, errors=np.array([np.nan, np.inf]), condition_number=np.inf)
-    save_fit(odd, tmp_path / "odd")
-    json.loads((tmp_path / "odd" / "fit.json").read_text(), parse_constant=pytest.fail)
-    assert_same(load_fit(tmp_path / "odd"), odd)
 
 
 def test_a_result_is_replaced_only_by_force_and_as_a_whole(coat_fit: Fit, tmp_path: Path) -> None:
@@ -114,37 +107,6 @@ def test_a_transport_that_has_no_name_is_refused(coat_fit: Fit, tmp_path: Path) 
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize(
-    ("name", "content", "words"),
-    [
-        ("fit.json", None, "no fit.json"),
-        ("fit.json", "{", "not valid JSON"),
-        ("fit.json", "[]", "must be an object"),
-        ("fit.json", '{"layerjax_result": 99}', "version 99"),
-        ("fit.json", '{"layerjax_result": 5}', "damaged"),
-        ("data.csv", None, "data.csv"),
-        ("data.csv", "", "data.csv: damaged or changed"),
-        ("problem.toml", "layers = 3", "problem.toml: damaged or changed"),
-    ],
-)
-def test_a_damaged_result_is_named(coat_fit: Fit, tmp_path: Path, name: str, content: str | None, words: str) -> None:
-    directory = tmp_path / "result"
-    save_fit(coat_fit, directory)
-    (directory / name).unlink()
-    if content is not None:
-        (directory / name).write_text(content)
-    with pytest.raises((ValueError, FileNotFoundError), match=words) as error:
-        load_fit(directory)
-    assert "result" in str(error.value)
-    assert "\n" not in str(error.value)
-
-
-def test_one_of_several_measurements_is_not_sampled_by_itself_where_it_was_saved(coat_fit: Fit, tmp_path: Path) -> None:
-    save_fit(replace(coat_fit, dataset="plane"), tmp_path / "fit")
-    with pytest.raises(ValueError, match="sample: 'plane' is a part of a joint fit"):
-        sample(load_fit(tmp_path / "fit"))
-
-
 # ---- posteriors ----
 
 
@@ -178,21 +140,6 @@ def damaged(content: bytes, step: int) -> Iterator[bytes]:
                 yield content[:place] + other + content[place + 64 :]
 
 
-def test_damage_to_a_chain_is_seen(result: Fit, tmp_path: Path) -> None:
-    """Wherever it matters: some bytes of a page of SQLite are of no use."""
-    path, refused = tmp_path / "chain.db", 0
-    sample(result, walkers=16, seed=1, max_steps=100, path=path)
-    whole, posterior = path.read_bytes(), load(result, path)
-    copies = [*damaged(whole, 4096), whole[:100], whole[:-1]]
-    for bad in copies:
-        path.write_bytes(bad)
-        try:
-            np.testing.assert_array_equal(load(result, path).chain, posterior.chain)
-        except ValueError as error:
-            refused += "chain.db: damaged" in str(error)
-    assert refused > 0.8 * len(copies)
-
-
 def test_damage_to_a_result_is_seen(coat_fit: Fit, tmp_path: Path) -> None:
     directory = tmp_path / "result"
     save_fit(coat_fit, directory)
@@ -206,9 +153,19 @@ def test_damage_to_a_result_is_seen(coat_fit: Fit, tmp_path: Path) -> None:
         path.write_bytes(whole)
     content = json.loads((directory / "fit.json").read_text())
     content["fit"]["cost"] += 1e-9
-    (directory / "fit.json").write_text(json.dumps(content))
-    with pytest.raises(ValueError, match=r"fit\.json: damaged or changed"):
-        load_fit(directory)
+    for name, text, words in (
+        ("fit.json", json.dumps(content), r"fit\.json: damaged or changed"),
+        ("fit.json", '{"layerjax_result": 99}', "is version 99 of the format"),
+        ("fit.json", None, "no fit.json"),
+        ("data.csv", None, "data.csv"),
+    ):
+        whole = (directory / name).read_text()
+        (directory / name).unlink()
+        if text is not None:
+            (directory / name).write_text(text)
+        with pytest.raises((ValueError, FileNotFoundError), match=words):
+            load_fit(directory)
+        (directory / name).write_text(whole)
 
 
 def test_what_killed_processes_left_is_tidied_up(coat_fit: Fit, tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from fits.data.geometry import Geometry, slices
+from fits.data.geometry import slices
 from fits.data.scans import correlation, neighbours, signed_angle
 from fits.optimise.fit import fit
 from fits.optimise.result import Fit
@@ -18,9 +18,8 @@ from fits.problem.noise import Noise
 from fits.problem.parameters import Free
 from fits.problem.problem import Problem
 from fits.reports import tables, verdicts
-from fits.reports.diagnostics import bsdf, misfit, standardised
-from fits.reports.plots.model import curves_picture
-from fits.reports.verdicts import assess, identifiability
+from fits.reports.plots.model import bsdf, curves_picture, misfit
+from fits.reports.verdicts import assess, identifiability, standardised
 from tests.helpers.models import along, drawn_discrepancy, line
 
 GEOMETRY = slices([10.0, 30.0, 50.0, 70.0], np.arange(-80.0, 81.0, 4.0))
@@ -104,9 +103,10 @@ def test_one_statement_weighs_size_and_correlation_of_residuals(coat_fit: Fit) -
     factor = np.sqrt(0.19) * np.sqrt(1.9 / 0.1)  # (1 + r) / (1 - r) for the correlation
     words = f"too small by a factor of about {factor:.2g} (0.44 for the size of the whitened residuals times 4.4"
     assert words in verdicts.statements(case)["verdict"][1].sentence
-    large = replace(facts, excess=9.0, ratio=9.0, lag_one=0.0)
-    words = "too small by a factor of about 3 (3 for the size of the residuals)"
-    assert words in verdicts.statements(large)["verdict"][1].sentence
+    far = replace(
+        facts, misfit=(1.04, 3.0)
+    )  # a large deviation is a factor: as a share of the model it is no more than 1
+    assert "within 4 % of the model, 95 % within a factor of 3" in verdicts.statements(far)["verdict"][0].sentence
 
 
 def test_the_verdict_is_three_sentences_and_quotes_the_misfit(coat_fit: Fit) -> None:
@@ -158,17 +158,6 @@ def test_a_stack_that_misses_is_named_though_the_discrepancy_absorbs_all(fitted:
     assert assess(right).described
 
 
-def test_a_large_misfit_is_a_factor(fitted: Fit) -> None:
-    """As a share of the model it was 100 % wherever the model was far too high."""
-    near = f"Half of the {len(GEOMETRY)} measurements are within WORDS of the stack without model discrepancy, 95 % "
-    for factor, words in ((1.04, "4 %"), (1 / 1.04, "4 %"), (3.0, "a factor of 3"), (1e4, "a factor of 1e+04")):
-        off = replace(fitted, problem=problem_of(factor * fitted.predicted))
-        vars(off)["predicted"] = fitted.predicted
-        facts = replace(assess(off), described=True)
-        said = verdicts.statements(facts)["verdict"][0].sentence
-        assert said.startswith(f"{near}within WORDS, ".replace("WORDS", words))
-
-
 def test_both_curves_are_drawn_and_the_residuals_are_those_of_the_one_with_the_discrepancy(fitted: Fit) -> None:
     figure = curves_picture({"model": fitted})
     assert isinstance(figure, Figure)
@@ -185,38 +174,15 @@ def test_both_curves_are_drawn_and_the_residuals_are_those_of_the_one_with_the_d
     np.testing.assert_allclose(np.asarray(points.get_ydata()), (values - drawn) / (0.02 * values), atol=0.15)
 
 
-ADDED = "Noise: the data's own sigma and `relative` are added in quadrature."
-
-
-@pytest.mark.parametrize(
-    ("noise", "sigma", "words"),
-    [
-        (Noise(), None, "No noise is stated: 5 % of the model's value is assumed."),
-        (Noise(relative=0.05), None, None),
-        (Noise(floor=0.01), None, None),
-        (Noise(relative=0.03), 0.04, ADDED),
-        (Noise(), 0.04, None),
-        (Noise(relative=0.03, use_sigma=False), 0.04, None),
-        (Noise(relative=0.0), 0.04, None),
-    ],
-)
-def test_noise_that_is_assumed_or_added_is_announced(noise: Noise, sigma: float | None, words: str | None) -> None:
-    problem = Problem(STACK, along(GEOMETRY, 1.0, sigma), line, noise)
-    assert [sentence.startswith(words or "?") for sentence in verdicts.noise_statements(problem)] == [True] * bool(
-        words
-    )
-    assert ("(assumed)" in tables.noise_in_words(problem)) == (words is not None and "assumed" in words)
-
-
-def test_repeated_measurements_offer_a_noise() -> None:
-    twice = Geometry(*(np.tile(w, (2, 1)) for w in (GEOMETRY.wi, GEOMETRY.wo)))
-    scattered = 1.0 + 0.0017 * np.random.default_rng(0).standard_normal((len(twice), 1))
-    (words,) = verdicts.noise_statements(Problem(STACK, along(twice, scattered), line, Noise()))
-    match = re.search(r"repeated measurements scatter by about ([\d.]+) %: `relative = ([\d.]+)`", words)
-    assert match is not None
-    # the median of 164 differences: 8 % of itself
-    assert float(match[1]) == pytest.approx(0.17, rel=0.3)
-    assert float(match[2]) == pytest.approx(0.0017, rel=0.3)
+def test_noise_that_is_assumed_is_announced(coat_fit: Fit) -> None:
+    (words,) = verdicts.statements(replace(assess(coat_fit), noise_assumed=True))["remarks"]
+    assert words.sentence.startswith("No noise is stated: 5 % of the model's value is assumed.")
+    for noise, sigma, said in (
+        (Noise(), None, "0.05 of the model's value (assumed), "),
+        (Noise(relative=0.03), 0.04, "the file's own sigma, 0.03 of the model's value, "),
+        (Noise(relative=0.03, use_sigma=False, tails="student"), 0.04, "0.03 of the model's value, "),
+    ):
+        assert tables.noise_in_words(Problem(STACK, along(GEOMETRY, 1.0, sigma), line, noise)).startswith(said)
 
 
 FIRST, SECOND = "layers[0].thickness", "base.albedo"
