@@ -34,9 +34,9 @@ layerjax render padauk --out padauk.png
 layerjax export padauk --to rgl --out padauk.bsdf
 ```
 
-Each picture shows spheres lit from the front, from the side and, if the material transmits light, from behind; and the
-lobes in the plane of incidence. All orders of scattering are included. `python -m tools.gallery --pictures` generates
-this page and its pictures.
+Each picture shows spheres lit from the front, from the side and, if the material transmits light, from behind; the
+lobes in the plane of incidence; and the BSDF in that plane as a function of the angles of light and viewer. All
+orders of scattering are included. `python -m tools.gallery --pictures` generates this page and its pictures.
 """
 
 
@@ -46,7 +46,7 @@ def page() -> str:
     for name in gallery.names():
         material = gallery.material(name)
         tables = material_to_dict(material.build())
-        alt = f"{name}: spheres and lobes"
+        alt = f"{name}: spheres, lobes and a map of the BSDF"
         parts.append(f"## {name}\n\n{material.source}: {material.remark}.\n\n![{alt}](gallery/{name}.jpg)\n")
         parts.append(f"```python\n{_stack(tables)}\n```\n")
     return "\n".join(parts)

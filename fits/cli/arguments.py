@@ -228,9 +228,13 @@ COMMANDS = {
         },
     ),
     "render": Command(
-        "draw a material: spheres and lobes",
+        "draw a material: spheres, lobes and a map of its BSDF",
         "layerjax render window_shade --out window_shade.png",
-        {"material": MATERIAL, "--out": _out("PNG", "file to write; its name ends in .png")},
+        {
+            "material": MATERIAL,
+            "--out": _out("PNG", "file to write; its name ends in .png"),
+            "--size": _one("pixels a sphere (default: %(default)s)", "N", type=count, default=256),
+        },
         "--force",
     ),
     "export": Command(

@@ -304,7 +304,8 @@ def render(arguments: Namespace) -> int:
         material.require_one("render")
         used = material.problem.transport
         material, transport = material.stack, used if isinstance(used, Transport) else None
-    figure = run_render(material, transport, title=Path(name).resolve().stem.replace("_", " "))
+    title = Path(name).resolve().stem.replace("_", " ")
+    figure = run_render(material, transport, title=title, size=arguments.size)
     write_bytes(arguments.out, as_png(figure), force=arguments.force)
     print(f"{arguments.out}: {name}")
     return DONE

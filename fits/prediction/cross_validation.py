@@ -39,6 +39,7 @@ DRAWS = 128  # draws of the posterior that held-out data are predicted with at a
 INFINITE_NOISE = 1e8  # noise with which a measurement does not influence a fit, in units of the largest measurement
 STACKING_STEPS = 20_000  # steps of the expectation maximisation of stacking weights, at most
 
+
 @dataclass(frozen=True, eq=False)
 class CrossValidation:
     """Predictive densities of held-out measurements.

@@ -1,4 +1,4 @@
-"""A picture of a material without a renderer: spheres, and lobes in the plane of incidence."""
+"""A picture of a material without a renderer: spheres, lobes in the plane of incidence, and light in by light out."""
 
 from typing import Literal
 
@@ -6,7 +6,8 @@ import jax.numpy as jnp
 import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
+from matplotlib.colors import LogNorm
+from matplotlib.figure import Figure, SubFigure
 from matplotlib.ticker import MaxNLocator
 from scipy.interpolate import RegularGridInterpolator
 
@@ -32,6 +33,9 @@ SUN, SKY = 0.8, 0.2
 SAMPLES, SKY_COSINES, SKY_AZIMUTHS = 2, 24, 24
 """Points along each side of a pixel, and directions at which the reflected sky is tabulated."""
 
+INCIDENT, OUTGOING = np.linspace(0.0, 90.0, 91), np.linspace(-90.0, 90.0, 181)
+"""Edges of the cells of the map of the BSDF, degrees."""
+
 
 def render(
     stack: lj.Stack | lj.Mixture,
@@ -40,7 +44,7 @@ def render(
     title: str = "",
     size: int = 256,
 ) -> Figure:
-    """Picture of a material: spheres under a directional light and a constant sky, and lobes.
+    """Picture of a material: spheres under a directional light and a constant sky, lobes, and a map of the BSDF.
 
     The sphere is a thin sheet with the sky on both sides: where it transmits, light from behind shines through. Of
     three channels the picture is in colour (red, green, blue), else grey by their mean.
@@ -69,18 +73,20 @@ def render(
     if isinstance(chosen, lj.Transport) and chosen.random:
         raise ValueError(f"transport: {type(chosen).__name__} is random; use a deterministic one: AddingDoubling()")
     prepared = lj.prepare(stack, chosen)
-    transmits = any(part.base is None for part in stacks_of(stack))
-    lights = [name for name in LIGHTS if transmits or name != "from behind"]
+    maps = _maps(prepared, any(part.base is None for part in stacks_of(stack)))
+    lights = [name for name in LIGHTS if "transmitted" in maps or name != "from behind"]
     with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(2.7 * len(lights) + 4.2, 3.4), layout="constrained")
+        figure = Figure(figsize=(10.5, 7.2), layout="constrained")
         if title:
             figure.suptitle(title)
-        left, right = np.ravel(figure.subfigures(1, 2, width_ratios=(2.7 * len(lights), 4.2), squeeze=False))
-        for axes, name in zip(left.subplots(1, len(lights), squeeze=False)[0], lights, strict=True):
+        above, below = np.ravel(figure.subfigures(2, 1, height_ratios=(1.0, 1.15), squeeze=False))
+        for axes, name in zip(above.subplots(1, len(lights), squeeze=False)[0], lights, strict=True):
             axes.imshow(_display(sphere(stack, prepared, LIGHTS[name], size)), interpolation="none")
             axes.set_title(name)
             axes.set_axis_off()
-        _lobes(right.subplots(subplot_kw={"projection": "polar"}), prepared, transmits)
+        left, right = np.ravel(below.subfigures(1, 2, width_ratios=(1.0, 1.25), squeeze=False))
+        _lobes(left.subplots(subplot_kw={"projection": "polar"}), prepared, "transmitted" in maps)
+        _draw_maps(right, maps)
     return figure
 
 
@@ -148,3 +154,29 @@ def _lobes(axes: Axes, prepared: Prepared, transmits: bool) -> None:
     axes.yaxis.set_major_locator(MaxNLocator(4))
     axes.set_title("√(f |cos θₒ|), 1/√sr, in the plane of incidence", pad=14)
     axes.legend(title="incidence", loc="lower left", bbox_to_anchor=(-0.3, -0.05))
+
+
+def _maps(prepared: Prepared, open_below: bool) -> dict[str, Floats]:
+    """The BSDF in the plane of incidence, (incident, outgoing) angles, of each side to which any light goes."""
+    incident, outgoing = (np.radians(0.5 * (edges[1:] + edges[:-1])) for edges in (INCIDENT, OUTGOING))
+    wi, sides = lj.direction(-incident, 0.0)[:, None], {"reflected": lj.direction(outgoing, 0.0)}
+    if open_below:
+        sides["transmitted"] = lj.direction(np.pi - outgoing, 0.0)
+    maps = {name: np.asarray(lj.evaluate(prepared, wi, wo)).mean(axis=-1) for name, wo in sides.items()}
+    return {name: values for name, values in maps.items() if name == "reflected" or np.any(values > 0)}
+
+
+def _draw_maps(figure: SubFigure, maps: dict[str, Floats]) -> None:
+    """Incident by outgoing angle, one map for each side; colours over the values off grazing, four decades at most."""
+    inner = [values[:75, 15:-15] for values in maps.values()]  # below 75 degrees
+    largest = max(float(values.max()) for values in inner) or 1.0
+    least = max(min(float(values.min()) for values in inner), 1e-4 * largest)
+    norm = LogNorm(min(least, 0.5 * largest), largest)
+    panels = figure.subplots(len(maps), 1, sharex=True, squeeze=False)[:, 0]
+    for axes, (name, values) in zip(panels, maps.items(), strict=True):
+        within = np.clip(values, norm.vmin, norm.vmax)
+        image = axes.pcolormesh(OUTGOING, INCIDENT, within, norm=norm, cmap="viridis", rasterized=True)
+        axes.set(ylabel="incidence, degrees", title=f"BSDF in the plane of incidence, {name}")
+        axes.grid(visible=False)
+        figure.colorbar(image, ax=axes, label="1/sr", extend="both")
+    panels[-1].set_xlabel("outgoing angle, degrees (+ forward, $-$ backward)")
