@@ -178,7 +178,7 @@ def _run_threads(work: Work, shared: Any, tasks: list[Any], threads: int | None)
         yield index, attempt(work, shared, task)
     running: dict[futures.Future[Any], int] = {}
     pool = futures.ThreadPoolExecutor(most)
-    try:  # none is begun before it is asked for: an interrupt need not wait for it
+    try:  # each is begun when there is room for it: an interrupt need not wait for the others
         while True:
             for index, task in islice(pending, most - len(running)):
                 running[pool.submit(broadcasting(attempt), work, shared, task)] = index

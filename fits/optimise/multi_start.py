@@ -30,7 +30,7 @@ from layerjax._numerics import broadcasting
 Floats = NDArray[np.float64]
 
 MOST_STEPS, MOST_ROUNDS = 200, 20
-"""Of a start, and how many times so many, while a round of them gains `LEAST_GAIN`."""
+"""Steps of a start in a round; and rounds, while each gains `LEAST_GAIN`."""
 LEAST_GAIN, LEAST_RELATIVE_GAIN = 1e-3, 1e-6
 """In the log-posterior; and for a named objective, as a share of the cost."""
 EARLY, FRONT = 20, 3

@@ -343,7 +343,7 @@ class Process(eqx.Module):
         return jnp.stack([jnp.asarray(number, float) for number in (at if channels > 1 else at[:4])])
 
     def _covariances(self, numbers: Array, channels: int) -> tuple[Array, Array]:
-        """Of channels, (C, C), and of inducing points, (R, R), but for the amplitude."""
+        """Covariances between channels, (C, C), and between inducing points, (R, R), at an amplitude of 1."""
         together = numbers[4] if channels > 1 else jnp.zeros(())
         sizes = jnp.exp(numbers[3] * log_scales(self.where))
         own = _with_jitter(correlation(self.where, self.where, numbers[1], numbers[2]))
@@ -368,7 +368,7 @@ class Process(eqx.Module):
         return factors.amplitude * (factors.channels.T @ (observed.T @ self.weights) @ factors.points).reshape(-1)
 
     def moves(self, numbers: Array, factors: Factors) -> Moves:
-        """By which the root of the covariance moves with each number."""
+        """What the root of the covariance changes by with each number."""
         changes = jax.jacfwd(lambda numbers: self._covariances(numbers, len(factors.channels)))(numbers)
         halves = []
         for root, change in zip((factors.channels, factors.points), changes, strict=True):
