@@ -36,9 +36,9 @@ def each(function: Callable[..., Array], *values: Sequence[Array]) -> Channels:
 
 
 def by_channel(function: Callable[[Any], Array], tree: Any) -> Channels:
-    """The function of a tree of parameters, of one channel: what differs between channels is an axis of one program.
+    """The function of a tree of parameters of one channel, for all channels along an axis of one program.
 
-    Without parameters that do, computed once.
+    It is computed once where no parameter differs between channels.
     """
     leaves, structure = jax.tree.flatten(tree)
     differing = [leaf for leaf in leaves if jnp.ndim(leaf)]

@@ -36,8 +36,9 @@ MANY = 3
 """Interfaces of a kind from which on they share a program."""
 
 DISTINCT, LEAST_ALPHA, MOST_ALPHA, STEP = 0.02, 2e-4, 0.99, 6e-6
-"""Differences stand for derivatives where indices are as far apart, of the least, and alpha within these two: by a step
-of this share of alpha, the root of the third order of the rounding in double precision."""
+"""An interface is differentiated by differences where any two indices differ by more than the first, relative to the
+smallest, and alpha lies between the next two. The step is the last times alpha: the cube root of the rounding in double
+precision, where truncation and rounding are least together."""
 
 
 class Plan(eqx.Module):

@@ -57,7 +57,8 @@ INDEX_SLACK = 1e-6
 """Of the logarithm of a ratio of indices: those that are given in single precision are rounded."""
 
 LANES = 8
-"""Numbers that processors work on at once. Of fewer pairs, channels would be what they do so: they are 1 or 3."""
+"""Pairs of directions from which on channels are an axis of the lobes' program. Of fewer (a texel has one), processors,
+which work on so many numbers at once, would run along the channels, of which there are 3."""
 
 Diffuse = Literal["tables", "exact", "lobe"]
 Energies = tuple[Channels, Channels]
