@@ -118,6 +118,15 @@ def test_what_takes_the_other_of_whole_and_part(joint):
     assert first.scale == 1.0
 
 
+def test_a_part_predicts_with_what_all_of_them_say(joint):
+    at = slices(incidence=(10,))
+    seen = predict(joint.part("first"), at, draws=4000)
+    columns = np.stack([at.wo[:, 2], np.ones(len(at)), np.zeros(len(at))], axis=-1)
+    _, covariance = least_squares(prior=False)
+    sd = np.sqrt(np.sum(columns @ covariance * columns, axis=-1))
+    np.testing.assert_allclose(seen.sd[:, 0], sd, rtol=0.06)  # of 4000 draws by weight
+
+
 def test_the_posterior_is_that_of_all(joint):
     found = sample(joint, ess=1000, seed=1)
     expected, covariance = least_squares(prior=False)
