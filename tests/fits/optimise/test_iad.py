@@ -108,18 +108,3 @@ def test_slabs_of_its_forward_model_are_what_it_inverts_them_to(tmp_path, albedo
     glass = f"{slides} 1 1" if slides > 1 else "1 1 0"
     text = f"IAD1 {ior} {glass} 5 1 0 200 25 12 1 .96 200 25 12 1 .96 2 {reflected} {passed}"
     assert_found(tmp_path, text, b * (1 - a), a * b, g)
-
-
-@pytest.mark.peers
-@pytest.mark.parametrize("g", [0.0, 0.8])
-def test_slabs_that_a_sphere_reads_are_told_from_its_gain(tmp_path, g):
-    """Readings by the gains of iadpython's sphere, whose `gain` is one over what it documents, of its own slab."""
-    iad = pytest.importorskip("iadpython")
-    albedo, depth, ior = 0.95, 2.0, 1.4
-    ur1, ut1, uru, _ = (float(part) for part in iad.Sample(a=albedo, b=depth, g=g, n=ior, quad_pts=16).rt())
-    sphere = iad.Sphere(100, 30, 15, 10, r_wall=0.95)
-    sphere._r_wall = 0.95
-    reflected = ur1 * sphere.gain(0.98) / sphere.gain(uru)
-    passed = ut1 * sphere.gain(0.0) / sphere.gain(uru)
-    text = f"IAD1 {ior} 1 1 0 5 0.98 1 100 30 15 10 .95 100 30 15 10 .95 2 {reflected} {passed}"
-    assert_found(tmp_path, text, depth * (1 - albedo), albedo * depth, g)
