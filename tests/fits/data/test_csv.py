@@ -1,5 +1,8 @@
 """CSV: what its columns mean, what is estimated and left out, and that what is written comes back."""
 
+import os
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -27,13 +30,27 @@ def test_a_real_file_against_numpy():
     assert data.source.notes == ("columns not used: n",)
 
 
-def test_capitals_quotes_blanks_comments_and_an_attribution(reading):
-    text = '# measured on a Monday\n# attribution: A. Author, CC-BY\n\n"Theta_I",theta_O,BRDF_Red,BRDF_Red_STD,Used\r\n'
-    data = reading(f"{text}10, 20, 1e-3, 1e-4,1\r\n\n")
-    assert (data.values.tolist(), data.sigma.tolist(), data.channels) == ([[1e-3]], [[1e-4]], ("Red",))
-    assert data.source.attribution == "A. Author, CC-BY"
-    windows = reading(f"# attribution: Prüfstand, 20 °C\n{HEADER}\n10,180,20,0,0.5\n".encode("cp1252"))
-    assert windows.source.attribution == "Prüfstand, 20 °C"
+def test_capitals_in_names_of_columns_are_as_good(reading, tmp_path):
+    data = reading("Theta_I,PHI_I,theta_O,Phi_o,BRDF_Red,BRDF_Red_STD,Used\n10,180,20,0,0.5,0.1,1\n")
+    assert (data.channels, data.source.notes) == (("Red",), ())
+    np.testing.assert_array_equal([data.values, data.sigma], [[[0.5]], [[0.1]]])
+    write_csv(data, tmp_path / "again.csv")
+    assert read(tmp_path / "again.csv").channels == ("Red",)
+    assert reading("THETA_I,THETA_O,BRDF\n10,20,0.5\n").channels == ("value",)
+    totals = reading("Theta_i,Total_Reflectance\n0,0.3\n")
+    np.testing.assert_array_equal(totals.values, [[0.3]])
+    for channel in ("Cos", "STD"):
+        with pytest.raises(ValueError, match=f"channel '{channel}' cannot be written"):
+            write_csv(replace(data, channels=(channel,)), tmp_path / "other.csv")
+
+
+def test_comments_may_be_of_windows(tmp_path):
+    path = tmp_path / "windows.csv"
+    text = f"# attribution: Prüfstand, 20 °C … Nr. 7\n{HEADER}\n10,180,20,0,0.5\n"
+    path.write_bytes(text.encode("cp1252"))
+    data = read(path)
+    assert data.source.attribution == "Prüfstand, 20 °C … Nr. 7"
+    assert len(data) == 1
 
 
 COSINE = 1 / np.cos(np.radians(60))
@@ -68,11 +85,14 @@ def test_quantities_are_converted_once_and_recorded(reading, tmp_path, column, q
 
 
 def test_one_of_several_quantities_is_chosen(reading):
-    text = "theta_i,theta_o,brdf_red,brf_red\n10,20,1,3\n20,20,1,3\n"
+    text = "theta_i,theta_o,brdf_red,brdf_650nm,brf_red\n10,20,1,2,3\n20,20,1,4,3\n"
     with pytest.raises(ValueError, match=r"2 quantities \(brdf, reflectance_factor\): choose one with quantity"):
         reading(text)
     data = reading(text, quantity="reflectance_factor")
-    assert (data.channels, data.values.shape, data.source.notes[-1]) == (("red",), (2, 1), "columns not used: brdf_red")
+    assert (data.channels, data.values.shape) == (("red",), (2, 1))
+    assert data.source.notes[-1] == "columns not used: brdf_red, brdf_650nm"
+    with pytest.raises(ValueError, match="no column 'brdf_cos'"):
+        reading(text, quantity="brdf_cos")
 
 
 def test_missing_spread_is_estimated_and_noted(reading):
@@ -100,7 +120,7 @@ def test_a_spread_beside_a_single_value_column_is_taken_for_its_own(reading, col
     assert colours.source.notes[-1] == f"columns not used: {column}"
 
 
-@pytest.mark.parametrize("missing", [" ", "NaN", "-nan", "NA", "null"])
+@pytest.mark.parametrize("missing", ["", " ", "nan", "NaN", "-nan", "NA", "null"])
 def test_what_was_not_measured_is_left_out_and_counted(reading, missing):
     rows = f"10,180,20,0,1,0.1,7\n10,180,25,0,{missing},0.1,8\n10,180,30,0,3,{missing},{missing}\n"
     data = reading(f"{HEADER},brdf_std,reflectance_factor\n{rows}", quantity="brdf")
@@ -118,9 +138,20 @@ def test_signed_theta_without_azimuths(reading):
     np.testing.assert_allclose(data.wo, direction([30, 30, 120], [0, 180, 180]), atol=1e-15)
     np.testing.assert_allclose(data.wi, direction([30, 30, 30], 180), atol=1e-15)  # mirror, then retro-reflection
     assert "signed" in data.source.notes[0]
-    tangent = reading("theta_i,phi_i,theta_o,phi_o,brdf_cos\n10,180,90,0,0\n90,180,10,0,1\n10,180,10,0,1\n")
-    np.testing.assert_array_equal(tangent.mask, [False, False, True])
-    assert tangent.source.notes == ("masked: 2 samples in the tangent plane (theta of 90 degrees)",)
+
+
+def test_the_tangent_plane_is_masked(reading):
+    data = reading("theta_i,phi_i,theta_o,phi_o,brdf_cos\n10,180,90,0,0\n90,180,10,0,1\n10,180,10,0,1\n")
+    np.testing.assert_array_equal(data.mask, [False, False, True])
+    assert np.isfinite(data.values).all()
+    assert data.source.notes == ("masked: 2 samples in the tangent plane (theta of 90 degrees)",)
+
+
+def test_comments_quotes_blanks_and_an_attribution(reading):
+    text = '# measured on a Monday\n# attribution: A. Author, CC-BY\n\n"theta_i","phi_i","theta_o","phi_o","brdf"\r\n'
+    data = reading(f"{text}10, 180, 20, 0, 1e-3\r\n\n")
+    assert data.values.tolist() == [[1e-3]]
+    assert (data.source.attribution, data.source.notes) == ("A. Author, CC-BY", ())
 
 
 def test_written_csv_comes_back_exactly(tmp_path):
@@ -146,15 +177,34 @@ def test_written_csv_comes_back_exactly(tmp_path):
     assert {"first note", "second note", "written by layerjax from somewhere (memory)"} <= set(again.source.notes)
 
 
-def test_the_writer_overwrites_only_by_force(tmp_path):
+def test_light_from_below_comes_back_but_is_refused_in_foreign_files(reading, tmp_path):
+    data = Measurements(direction([120], 180), direction([30], 0), [[1.0]], None, [True], ("value",))
+    path = tmp_path / "out.csv"
+    write_csv(data, path)
+    np.testing.assert_allclose(read(path).wi, data.wi, atol=5e-12)
+    with pytest.raises(ValueError, match=r"column 'theta_i': 120\.0 is not allowed"):
+        reading(path.read_text().replace("# layerjax measurements", "# mine"))
+
+
+def test_the_writer_is_atomic_and_does_not_overwrite(tmp_path, monkeypatch):
     path = tmp_path / "out.csv"
     path.write_text("precious")
     with pytest.raises(ValueError, match=r"out\.csv: the file exists already"):
         write_csv(ONE, path)
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "replace", full_disk)
+        with pytest.raises(OSError, match="disk full"):
+            write_csv(ONE, path, force=True)
+    assert path.read_text() == "precious"
+    assert list(tmp_path.iterdir()) == [path]
     write_csv(ONE, path, force=True)
     np.testing.assert_array_equal(read(path).values, ONE.values)
     with pytest.raises(ValueError, match="there is no directory"):
         write_csv(ONE, tmp_path / "no" / "out.csv")
+
+
+def full_disk(*_):
+    raise OSError("disk full")
 
 
 def test_channels_come_back_or_are_not_written(tmp_path):
@@ -164,7 +214,7 @@ def test_channels_come_back_or_are_not_written(tmp_path):
     def with_channel(channel):
         return Measurements(ONE.wi, ONE.wo, [[1.0, 2.0]], [[0.1, 0.2]], ONE.mask, ("red", channel))
 
-    for channel in ("cos", "Cos_red", "blue_std", "sigma", "", "red ", "red\nedge"):
+    for channel in ("cos", "cos_red", "blue_std", "blue_sigma", "sigma", "", "red ", "red\nedge"):
         with pytest.raises(ValueError, match=r"channel .* cannot be written: its column would be read as"):
             write_csv(with_channel(channel), path)
         assert not path.exists()

@@ -65,6 +65,8 @@ def test_channels_have_names_and_are_chosen_by_them():
         ({"wo": 2 * direction([1, 2, 3], 0)}, "wo has length 2, must be 1"),
         ({"values": np.array([[1.0], [np.nan], [1.0]])}, "values holds nan, must be finite"),
         ({"sigma": np.array([[1.0], [-0.5], [1.0]])}, "sigma is -0.5, must be >= 0"),
+        ({"sigma": np.zeros((3, 1))}, "sigma is 0 in a sample that is used"),
+        ({"values": np.array([[1.0], [-1e300], [1.0]])}, r"values holds 1e\+300, must be at most 1e\+30 in size"),
         ({"sigma": np.full((3, 1), 1e300)}, r"sigma holds 1e\+300, must be at most 1e\+30 in size"),
         ({"sigma": np.full((3, 1), 1e-200)}, "sigma is 1e-200 in a sample that is used, must be > 0, at least 1e-100"),
     ],

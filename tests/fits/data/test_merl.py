@@ -1,11 +1,19 @@
 """MERL tables: a file written from a formula in half and difference angles is looked up again, by angles or bins."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+import layerjax as lj
+from fits.cli.parser import main
 from fits.data.formats.merl import half_difference
 from fits.data.geometry import Geometry, direction, slices
 from fits.data.reading import read
+from fits.data.scans import in_plane, incidences, relative_azimuth
+from fits.optimise.fit import fit
+from fits.problem.parameters import Free
+from tests.helpers.commands import refused
 from tests.helpers.data_files import written
 from tests.helpers.merl import SCALE, SHAPE, centre_angles, centre_pairs, smooth_bsdf, write_merl
 
@@ -55,8 +63,6 @@ def geometry():
 
 
 def test_centre_lookup_reads_bins_as_they_are_at_their_centre_angles(path, geometry, table):
-    asked = Geometry(geometry.wi[:50], geometry.wo[:50])
-    assert sorted(set(read(path).theta_i.round(-1))) == [10, 30, 50, 70]  # the default slices
     for data in (read(path), read(path, geometry=geometry)):
         index = bins_of(own_angles(data))
         centres = ((index + 0.5) / SHAPE) ** [2, 1, 1] * [np.pi / 2, np.pi / 2, np.pi]
@@ -65,11 +71,18 @@ def test_centre_lookup_reads_bins_as_they_are_at_their_centre_angles(path, geome
         assert len(np.unique(index, axis=0)) == len(data)
         assert data.mask.all()
         assert f"measurements at the centres of {len(data)} bins" in data.source.notes[1]
+
+
+def test_centres_are_near_what_was_asked_for(path, geometry):
+    asked = Geometry(geometry.wi[:50], geometry.wo[:50])
+    data = read(path, geometry=asked)
+    assert len(data) == 50
+    off = abs(data.theta_i - asked.theta_i)
+    assert off.max() < 0.75
+    assert np.mean(off < 0.21) > 0.9  # near retro-reflection there are bins for few incidences
+    np.testing.assert_allclose(data.phi_i, asked.phi_i, atol=1e-8)
     # directions that were exchanged or mirrored would be tens of degrees away
-    assert np.degrees(np.linalg.norm(read(path, geometry=asked).wo - asked.wo, axis=-1)).max() < 6
-    low = Geometry(direction([89.996], 180), direction([89.996], 4.78))  # half a bin puts one below the horizon
-    with pytest.raises(ValueError, match="geometry holds only pairs too near the horizon"):
-        read(path, geometry=low)
+    assert np.degrees(np.linalg.norm(data.wo - asked.wo, axis=-1)).max() < 6
 
 
 def test_a_pair_at_a_centre_stays_and_its_reciprocal_is_the_same_reading(path, table):
@@ -84,6 +97,63 @@ def test_a_pair_at_a_centre_stays_and_its_reciprocal_is_the_same_reading(path, t
     assert any("skipped: 4 of the 8 pairs requested" in note for note in both.source.notes)
 
 
+def test_centres_along_the_default_slices_remain_slices(path):
+    data = read(path)
+    assert 380 < len(data) < 420
+    groups = incidences(data)
+    np.testing.assert_allclose([group.theta for group in groups], [10.5, 30.5, 50.5, 70.5], atol=0.1)
+    np.testing.assert_allclose(data.phi_i, 180, atol=1e-8)
+    for group in groups:
+        assert np.count_nonzero(in_plane(data)[group.rows]) >= 25
+        theta_i, theta_o = data.theta_i[group.rows], data.theta_o[group.rows]
+        peak = in_plane(data)[group.rows] & (abs(relative_azimuth(data)[group.rows]) < 1)
+        assert abs(theta_o - theta_i)[peak].min() < 0.01  # the mirror direction
+
+
+def test_light_along_the_normal_and_pairs_at_the_horizon(path):
+    upright = read(path, geometry=slices(incidence=0.0, outgoing=(-40.0, 0.0, 40.0)))
+    assert upright.theta_i.max() < 0.75
+    np.testing.assert_allclose(upright.phi_i, 180, atol=1e-8)
+    np.testing.assert_allclose(upright.theta_o, [40, 0, 40], atol=5)
+    # half a degree of phi_d puts one of the two below the horizon in every bin near this pair
+    low = direction([89.996, 30], 180), direction([89.996, 30], [4.78, 0])
+    assert len(read(path, geometry=Geometry(*low))) == 1
+    with pytest.raises(ValueError, match="geometry holds only pairs too near the horizon"):
+        read(path, geometry=Geometry(low[0][:1], low[1][:1]))
+
+
+def flakes(thickness, albedo):
+    medium = lj.Medium(thickness=thickness, albedo=0.9, phase=lj.SGGX("surface", 0.02))
+    return lj.Stack([medium], base=lj.Lambertian(albedo=albedo))
+
+
+@pytest.fixture(scope="module")
+def flakes_path(tmp_path_factory):
+    """An exact table of flakes of thickness 0.8 over Lambertian(0.5), with values near the default slices only."""
+    wi, wo = centre_pairs(np.stack(np.unravel_index(np.arange(np.prod(SHAPE)), SHAPE), axis=-1))
+    near = np.zeros(len(wi), bool)
+    for theta in (10.5, 30.5, 50.5, 70.5):
+        near |= (abs(np.degrees(np.arccos([wi[:, 2], wo[:, 2]])) - theta) < 0.3).any(axis=0)
+    near &= (wi[:, 2] > 0) & (wo[:, 2] > 0)
+    values = np.full(len(wi), -1.0)
+    values[near] = lj.evaluate(flakes(0.8, 0.5), wi[near], wo[near], lj.SingleScattering())[:, 0]
+    return write_merl(
+        tmp_path_factory.mktemp("merl") / "flakes.binary", np.broadcast_to(values.reshape(SHAPE), (3, *SHAPE))
+    )
+
+
+@pytest.mark.slow
+def test_an_exact_table_gives_back_its_stack(flakes_path):
+    data = read(flakes_path)
+    assert data.mask.all()
+    data = replace(data, sigma=0.01 * data.values)
+    start = flakes(Free(1.5, 0.05, 5.0), Free(0.3, 0.0, 1.0))
+    found = fit(start, data, transport=lj.SingleScattering(), starts=2)
+    assert found.converged
+    assert found.values["layers[0].thickness"] == pytest.approx(0.8, abs=1e-7)
+    assert found.values["base.albedo"] == pytest.approx(0.5, abs=1e-7)
+
+
 def test_linear_lookup_recovers_the_formula(path, geometry, table):
     data = read(path, geometry=geometry, lookup="linear")
     np.testing.assert_array_equal([data.wi, data.wo], [geometry.wi, geometry.wo])
@@ -95,8 +165,23 @@ def test_linear_lookup_recovers_the_formula(path, geometry, table):
     assert data.mask.all()
     assert data.channels == ("red", "green", "blue")
     assert "centre at i + 1/2" in data.source.notes[0]
-    nearest = read(path, geometry=geometry, lookup="nearest")
-    np.testing.assert_allclose(nearest.values, table[:, *bins_of(own_angles(geometry)).T].T, rtol=1e-14)
+    # mirror, normal and retro directions
+    edges = Geometry(direction([30, 0, 30, 80, 0], 180), direction([30, 0, -30, 80, 85], 0))
+    data, expected = read(path, geometry=edges, lookup="linear"), smooth_bsdf(*own_angles(edges)).T
+    assert data.mask.all()
+    np.testing.assert_allclose(data.values[:, :2], expected[:, :2], rtol=0.02)
+
+
+def test_nearest_lookup_takes_the_bin_of_the_database_code(path, geometry, table):
+    data = read(path, geometry=geometry, lookup="nearest")
+    np.testing.assert_allclose(data.values, table[:, *bins_of(own_angles(geometry)).T].T, rtol=1e-14)
+
+
+def test_default_slices(path):
+    data = read(path, lookup="linear")
+    assert len(data) == 4 * (35 + 34 + 34)
+    assert sorted(set(data.theta_i)) == [10, 30, 50, 70]
+    assert len(np.unique(np.hstack([data.wi, data.wo]).round(6), axis=0)) == len(data)
 
 
 def test_bins_without_measurement_are_masked(tmp_path, table):
@@ -107,6 +192,7 @@ def test_bins_without_measurement_are_masked(tmp_path, table):
         data = read(path, geometry=seen, lookup=lookup)
         np.testing.assert_array_equal(data.mask, [True, False])  # theta_d of 2.5 and of 60 degrees
         np.testing.assert_array_equal(data.values[1], 0)
+        assert "masked: 1 sample that need a bin without a measurement" in data.source.notes
 
 
 def test_bins_that_hold_nan_are_left_out_and_counted(tmp_path, path, table):
@@ -156,7 +242,7 @@ def test_every_bin_is_read_once(holed_path, holed, readable):
 
 
 @pytest.mark.parametrize("strata", ["bins", "flux"])
-def test_a_choice_has_bins_as_they_are_and_none_twice(path, holed_path, holed, readable, strata):
+def test_a_choice_has_bins_as_they_are_and_none_twice(holed_path, holed, readable, strata):
     data = read(holed_path, bins=COUNT, strata=strata)
     bins = bins_of(half_difference(data.wi, data.wo))
     assert len(np.unique(bins, axis=0)) == len(data) == COUNT
@@ -165,16 +251,27 @@ def test_a_choice_has_bins_as_they_are_and_none_twice(path, holed_path, holed, r
     again, other = (read(holed_path, bins=COUNT, strata=strata, seed=seed) for seed in (0, 1))
     np.testing.assert_array_equal(again.wi, data.wi)
     assert not np.array_equal(other.wi, data.wi)
-    if strata == "flux":  # over both hemispheres, weighed by their cosines: means of cos and cos cos are 2/3 and 4/9
-        i, o = (getattr(read(path, bins=COUNT, strata="flux"), name)[:, 2] for name in ("wi", "wo"))
-        for found, expected in ((i, 2 / 3), (o, 2 / 3), (i * o, 4 / 9)):
-            assert found.mean() == pytest.approx(expected, abs=0.5 * found.std() / np.sqrt(COUNT))
-    else:  # blocks of a fifth of each index have their share: chance alone would be off by 1 / sqrt(N)
+    if strata == "bins":  # blocks of a fifth of each index have their share: chance alone would be off by 1 / sqrt(N)
         for axis, size in enumerate(SHAPE):
             edges = np.linspace(0, size, 6)
             found, _ = np.histogram(bins[:, axis], edges)
             expected, _ = np.histogram(np.nonzero(readable)[axis], edges)
             np.testing.assert_allclose(found / COUNT, expected / readable.sum(), atol=0.2 / np.sqrt(COUNT))
+
+
+def test_a_choice_by_flux_has_means_of_the_hemisphere(path):
+    """Over both hemispheres, weighed by their cosines: means of cos, cos cos and cos^2 are 2/3, 4/9 and 1/2."""
+    data = read(path, bins=COUNT, strata="flux")
+    i, o = data.wi[:, 2], data.wo[:, 2]
+    for found, expected in ((i, 2 / 3), (o, 2 / 3), (i * o, 4 / 9), (i * i, 1 / 2)):
+        assert found.mean() == pytest.approx(expected, abs=0.5 * found.std() / np.sqrt(COUNT))
+
+
+def test_on_the_command_line(holed_path, tmp_path, capsys):
+    words = ["convert", str(holed_path), str(tmp_path / "some.csv"), "--read", "strata=flux"]
+    assert "strata is given without a number of bins" in refused(words, capsys, tmp_path)
+    assert main([*words, "bins=50"]) == 0
+    assert len(read(tmp_path / "some.csv")) == 50
 
 
 # ---- what is refused ----
@@ -186,7 +283,7 @@ def test_bad_arguments(holed_path):
         ({"lookup": "cubic"}, "lookup is 'cubic', must be one of centre, linear, nearest"),
         ({"geometry": slices(outgoing=[100])}, "at or below the horizon"),
         ({"quantity": "brdf_cos"}, "a MERL file always holds 'brdf'"),
-        *(({"bins": bad}, f"bins is {bad!r}, {bins}") for bad in (0, 2.5, True, "most")),
+        *(({"bins": bad}, f"bins is {bad!r}, {bins}") for bad in (0, -3, 2.5, True, "most")),
         ({"bins": 200_000}, "bins is 200000, must be at most 100000 of the"),
         ({"strata": "flux"}, "strata is given without a number of bins"),
         ({"bins": 10, "strata": "area"}, "strata is 'area', must be one of bins, flux"),
@@ -201,7 +298,7 @@ def test_bad_files(tmp_path):
     def filled(number):
         return HEADER + np.full(3 * np.prod(SHAPE), number).tobytes()
 
-    short = {size: f"truncated MERL file, {size} bytes found, {SIZE} expected" for size in (5, SIZE - 1)}
+    short = {size: f"truncated MERL file, {size} bytes found, {SIZE} expected" for size in (5, 12, 1000, SIZE - 1)}
     for content, message in (
         *((filled(0.1)[:size], words) for size, words in short.items()),
         (np.array([90, 90, 360], "<i4").tobytes() + bytes(100), r"MERL header says \(90, 90, 360\), must be \(90, 90,"),

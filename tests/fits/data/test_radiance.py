@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from fits.data.geometry import direction, slices
 from fits.data.reading import read
 from tests.helpers.data_files import written
 
@@ -25,6 +26,33 @@ def programs(monkeypatch):
 
 def output(*words):
     return subprocess.run([*map(str, words)], check=True, capture_output=True).stdout
+
+
+def test_radiance_takes_the_azimuths_of_pab_as_we_do(tmp_path):
+    """A lobe off the plane of incidence, by `pabopto2bsdf` and `bsdf2ttree`, lies where our reading of the file is."""
+    names = []
+    for theta in (0.0, 20.0, 40.0, 60.0):  # the same azimuth: isotropic
+        geometry = slices([theta], np.arange(0, 85, 2.5), list(np.arange(0, 360, 10.0)))
+        peak = direction(theta, 180 + 30)
+        value = 0.05 + 2.0 * np.exp(-20 * (1 - geometry.wo @ peak))
+        rows = np.stack([geometry.theta_o, geometry.phi_o, value], axis=-1)
+        head = f"#incident_angle {theta} 0\n#format: theta phi BSDF\n#upphi 90\n"
+        body = "\n".join(" ".join(f"{number:.6g}" for number in row) for row in rows)
+        names.append(written(tmp_path, f"{head}{body}\n", f"{theta:g}.dat"))
+    written(tmp_path, output("pabopto2bsdf", "-s", "i", *names), "a.sir")
+    theirs = read(written(tmp_path, output("bsdf2ttree", "-g", "5", tmp_path / "a.sir"), "a.xml"))
+    ours = read(tmp_path / "40.dat")
+
+    def off_plane(data) -> float:
+        """Azimuth of the mean direction of the lobe, from where the light travels."""
+        near = (abs(data.theta_i % 180 - (40 if data is ours else 140)) < 6) & (data.values[:, 0] > 0.5)
+        azimuth = np.radians(data.phi_o[near] - data.phi_i[near] - 180)
+        return float(np.degrees(np.angle(np.sum(data.values[near, 0] * np.exp(1j * azimuth)))))
+
+    assert off_plane(ours) == pytest.approx(30, abs=1)
+    # its z points to the room, to WINDOW's back: turned over, azimuths run the other way
+    assert set(np.sign(theirs.wi[:, 2])) == {-1}
+    assert off_plane(theirs) == pytest.approx(-30, abs=2)  # it fits a sum of Gaussians, in boxes of 4 degrees and more
 
 
 FUNCTION = "f(ix,iy,iz,ox,oy,oz)=.16+.03*(ix*oy-iy*ox)+if(iz,.03,.01)+if(iz*oz,.4,.9)*exp(-6*((ix+ox)^2+(iy+oy)^2))"

@@ -98,8 +98,11 @@ def test_what_is_written_is_read(path, tmp_path):
         ("rgb", lambda values, fields: fields.update(spectra=values), "no field 'wavelengths'"),
         ("rgb", lambda values, _: np.where(values == values.max(), np.nan, values), "field 'rgb' holds nan, must be f"),
         ("vndf", lambda values, _: values[:, :2], "field 'vndf' has shape"),
+        ("ndf", lambda values, _: values[0], "field 'ndf' has shape"),
+        ("theta_i", lambda values, _: values * 2, "field 'theta_i' holds 2.09"),
         ("theta_i", lambda values, _: values[::-1], "field 'theta_i' must ascend"),
         ("ndf", lambda values, _: -values, "field 'ndf' holds -1.3, must be >= 0"),
+        ("sigma", lambda values, _: 0 * values, "field 'sigma' holds 0"),
         ("vndf", lambda values, _: 0 * values, "field 'vndf' is 0 everywhere"),
     ],
 )
@@ -109,3 +112,14 @@ def test_what_is_wrong_is_named(path, reading, name, change, message):
     fields = {key: value for key, value in fields.items() if value is not None}
     with pytest.raises(ValueError, match=message):
         reading(fields_as_bytes(fields))
+
+
+def test_bad_arguments(path):
+    for given, message in (
+        ({"quantity": "brdf"}, "always holds 'brdf_cos'"),
+        ({"geometry": slices(outgoing=(120.0,))}, "at or below the horizon"),
+        ({"strata": "flux"}, "lookup and strata apply to MERL files only"),
+        ({"geometry": slices(), "bins": 10}, "bins stands beside geometry"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            read(path, **given)

@@ -28,6 +28,14 @@ def test_rows_by_a_count(slab):
     np.testing.assert_allclose(found.totals.sigma, 0.02)
 
 
+def test_all_on_one_line_and_without_wavelengths(slab):
+    found = slab("IAD1 1.4 1.0 1 0 5 .96 0 200 25 12 1 .96 200 25 12 1 .96 2 0.168 0.249 0.162 0.264")
+    assert found.wavelengths is None
+    assert found.totals.channels == ("row 1", "row 2")
+    np.testing.assert_allclose(found.totals.values, [[0.168, 0.162], [0.249, 0.264]])
+    assert found.ior_slides == 1.0
+
+
 @pytest.mark.parametrize(
     ("slides", "ior", "expected"),
     [
@@ -103,7 +111,10 @@ def test_headers_say_which_spheres(slab):
     assert slab(none).totals.spheres == Spheres(front, None, 0.98)
 
 
-@pytest.mark.parametrize("comment", ["measured by a dual beam spectrometer", "use 'iad -X -i 8 -g 0.9 filename'"])
+@pytest.mark.parametrize(
+    "comment",
+    ["measured by a dual beam spectrometer", "Process this file as 'iad -X -i 8 -g 0.9 filename'", "dual-beam method"],
+)
 def test_two_beams_need_no_sphere(slab, comment):
     """iad's ``-X``, which such a file asks for: what is read is the sample's own."""
     text = f"{ONE}2\n0.3 0.4\n".replace("a slab", comment)
@@ -120,11 +131,19 @@ def test_two_beams_need_no_sphere(slab, comment):
 def test_the_command_line_chooses_rows_and_spheres(tmp_path, capsys):
     path = str(written(tmp_path, f"{ONE}L r n\n600 0.3 1.3\n620 0.25 1.3\n900 0.2 1.5\n", "slab.rxt"))
     out = str(tmp_path / "a.csv")
-    for words, message in (
-        ([], "restrict the wavelengths"),
-        (["--read", "wavelengths=600,610,620"], "must be two numbers in nm, the lowest and the highest"),
-    ):
-        assert main(["convert", path, out, *words]) == 2
-        assert message in capsys.readouterr().err
+    assert main(["convert", path, out]) == 2
+    assert "restrict the wavelengths" in capsys.readouterr().err
+    assert main(["convert", path, out, "--read", "wavelengths=600,610,620"]) == 2
+    assert "must be two numbers in nm, the lowest and the highest" in capsys.readouterr().err
+    for more, corrected in (([], False), (["corrected=yes"], True)):
+        assert (
+            main(["info", path, "--out", str(tmp_path / "a.png"), "--force", "--read", "wavelengths=600,620", *more])
+            == 0
+        )
+        said = capsys.readouterr().out
+        assert "600 nm, 620 nm" in said
+        assert ("as measured with an integrating sphere" in said) != corrected
     assert main(["convert", path, out, "--read", "wavelengths=600,620", "corrected=yes"]) == 0
     np.testing.assert_allclose(read(out).values, [[0.3, 0.25]])
+    assert main(["info", out, "--read", "corrected=yes"]) == 2
+    assert "wavelengths and corrected apply to rxt files only" in capsys.readouterr().err

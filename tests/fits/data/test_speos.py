@@ -1,5 +1,7 @@
 """Speos tables: a file of Speos' own, and files written from formulas."""
 
+import tracemalloc
+
 import numpy as np
 import pytest
 
@@ -51,6 +53,20 @@ def test_a_file_of_speos():
         assert data.phi_o[peak] == 0
     with pytest.raises(ValueError, match="quantity is 'brdf', this speos file says 'brdf_cos'"):
         read(GAUSSIAN, quantity="brdf")
+
+
+def test_a_file_of_speos_holds_the_shares_that_it_states():
+    """4 % above and 95 % below at perpendicular incidence, and here at 30 degrees: integrals of the intensities."""
+    lines, data = GAUSSIAN.read_text().splitlines(), read(GAUSSIAN)
+    starts = [number for number, line in enumerate(lines) if line == "41 95"]
+    for start, stated, theta in zip(starts, (0.04, 0.95), (30, 160), strict=True):
+        phi, rows = np.loadtxt(lines[start + 1 : start + 2]), np.loadtxt(lines[start + 2 : start + 43])
+        polar = np.radians(rows[:, 0])
+        found = np.trapezoid(np.trapezoid(rows[:, 1:], np.radians(phi), axis=1) * np.sin(polar), polar)
+        assert found == pytest.approx(stated, rel=0.06)
+        at = rows[rows[:, 0] == theta, 1][0] * stated / found / abs(np.cos(np.radians(theta)))
+        here = (abs(data.theta_o - theta) < 1e-6) & (data.phi_o == 0)
+        np.testing.assert_allclose(data.values[here, 0], at, rtol=1e-2)  # trapezoids of a product, here
 
 
 def test_anisotropic_by_formula(reading):
@@ -107,5 +123,10 @@ def test_isotropic_by_formula(reading):
 def test_a_long_spectrum_may_stand_for_more_than_there_is_room_for(reading):
     """A small file: all values of its tables at each of 30,000 wavelengths would be 23 million."""
     spectrum = "10\t0\nwhite\n30000\n" + "".join(f"{400 + 0.01 * k:.2f} {20 + k % 7}\n" for k in range(30_000))
+    text = anisotropic(table(THETA, lobe(10.0, THETA[:, None], PHI)), spectrum)
+    tracemalloc.start()
     with pytest.raises(ValueError, match=r"of 30000 channels are 23,250,000 numbers, must be 20,000,000 at most"):
-        reading(anisotropic(table(THETA, lobe(10.0, THETA[:, None], PHI)), spectrum))
+        reading(text)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 100e6

@@ -8,6 +8,7 @@ from scipy import special
 import layerjax as lj
 from fits.data.spheres import Shares, Sphere, Spheres
 from fits.data.totals import Totals
+from fits.optimise.fit import fit
 from fits.problem.parameters import Free
 from fits.problem.problem import Problem
 
@@ -68,6 +69,46 @@ def test_an_absorbing_slab_is_seen_by_diffuse_light_through_e3() -> None:
     passed = 2.0 * special.expn(3, depth)
     expected = spheres.measured(Shares(0.0, np.exp(-depth), 0.0, 0.0, passed, passed))
     np.testing.assert_allclose(np.ravel(problem.predict([depth])), expected, rtol=1e-4)
+
+
+def test_what_is_opaque_reflects_diffuse_light() -> None:
+    spheres = Spheres(FRONT, standard=0.98)
+    totals = Totals.of(8.0, reflectance=0.5, spheres=spheres)
+    problem = Problem(lj.Stack([], lj.Lambertian(Free(0.5, 0.0, 1.0))), totals, lj.SingleScattering())
+    for albedo in (0.0, 0.3, 1.0):
+        expected, _ = spheres.measured(Shares(albedo, 0.0, albedo, 0.0, 0.0, 0.0))
+        np.testing.assert_allclose(problem.predict([albedo])[0, 0], expected, rtol=1e-6, atol=1e-12)
+
+
+@pytest.mark.slow
+def test_light_from_behind_meets_the_other_face() -> None:
+    """A slab that is dark on one side: only the sphere there sees it."""
+    grey, white = lj.Medium(0.5, 0.2), lj.Medium(Free(1.0, 0.1, 5.0), 0.999)
+    solver = lj.AddingDoubling(nodes=8, modes=1)
+
+    def predicted(layers, spheres):
+        totals = Totals.of(0.0, transmittance=0.5, spheres=spheres)
+        return float(Problem(lj.Stack(layers), totals, solver).predict([1.0])[0, 0])
+
+    gains = [
+        predicted(layers, Spheres(None, BEHIND)) / predicted(layers, None) for layers in ([grey, white], [white, grey])
+    ]
+    assert gains[0] > 1.02 * gains[1]
+
+
+@pytest.mark.slow
+def test_coefficients_are_recovered_through_spheres() -> None:
+    spheres = Spheres(FRONT, BEHIND, standard=0.98, together=True)
+    slab = lj.Stack([lj.TurbidMedium(1.0, Free(2.0, 0.1, 50.0), Free(0.5, 1e-3, 5.0), lj.HenyeyGreenstein(0.5))])
+    solver = lj.AddingDoubling(nodes=8, modes=1)
+
+    def totals(values: np.ndarray, seen: Spheres | None) -> Totals:
+        return Totals.of(0.0, reflectance=values[0], transmittance=values[1], sigma=0.001, spheres=seen)
+
+    exact = np.ravel(Problem(slab, totals(np.array([0.2, 0.3]), spheres), solver).predict([5.0, 0.2]))
+    found, blind = (fit(slab, totals(exact, seen), transport=solver, starts=2) for seen in (spheres, None))
+    np.testing.assert_allclose(list(found.values.values()), [5.0, 0.2], rtol=1e-4)
+    assert abs(blind.values["layers[0].mu_a"] / 0.2 - 1.0) > 0.05
 
 
 @pytest.mark.parametrize(

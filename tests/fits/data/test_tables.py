@@ -10,7 +10,7 @@ from tests.helpers.places import COATINGS
 ASTM = "ASTM 1\nDATE 4/8/1998\nSAMPLE Paint, blue\nNUM_POINTS 2\nVARS theta_i,phi_i,theta_s,phi_s,R,G,B\n"
 
 
-def test_astm_in_radians_and_degrees(reading):
+def test_astm_in_radians(reading):
     """Both azimuths in one frame, as the directions stand."""
     data = reading(f"{ASTM}0.5,3.14159265,0.25,0.1,0.1,0.2,0.3\n\n0.5,1,-0.25,6.2,0.4,0.5,-0.01\n")
     assert data.channels == ("red", "green", "blue")
@@ -19,11 +19,27 @@ def test_astm_in_radians_and_degrees(reading):
     np.testing.assert_allclose(data.wo, direction(quarter, [first, second + 180]), atol=1e-12)
     np.testing.assert_array_equal(data.values, [[0.1, 0.2, 0.3], [0.4, 0.5, -0.01]])
     assert data.source.notes == ("angles taken as radians", "1 sample below zero, kept as measured")
+
+
+def test_astm_in_degrees_with_blanks_and_wavelengths(reading):
     text = "VARS theta_i phi_i theta_s phi_s 550nm 650nm\n30 180 40 0 0.1 0.2\n30 180 120 0 0.1 0.2\n"
     data = reading(text, quantity="brdf_cos")
     assert data.channels == ("550 nm", "650 nm")
+    np.testing.assert_allclose(data.theta_o, [40, 120])
     np.testing.assert_allclose(data.values[:, 0], [0.1 / np.cos(np.radians(40)), 0.1 / 0.5])
     assert data.source.notes[0].startswith("angles taken as degrees")
+
+
+def test_astm_without_azimuth_of_the_light(reading):
+    data = reading("VARS theta_i,theta_s,phi_s,Integrated BRDF\n0.3,0.3,0,0.7\n")
+    np.testing.assert_allclose(data.wi * [-1, 1, 1], data.wo, atol=1e-15)
+    assert data.channels == ("value",)
+
+
+def test_many_numbers_of_astm(tmp_path):
+    numbers = np.random.default_rng(0).random((20_000, 7))
+    np.savetxt(tmp_path / "big.astm", numbers, "%.6f", ",", header=ASTM.strip(), comments="")
+    np.testing.assert_allclose(read(tmp_path / "big.astm").values, numbers[:, 4:].round(6))
 
 
 PAB = """#sample_name "a sample"
@@ -45,6 +61,15 @@ def test_pab_as_in_the_manual_of_radiance(reading):
     same = reading(apart)
     np.testing.assert_array_equal(same.values, data.values)
     assert "up is at phi 90" in same.source.notes[-1]
+
+
+def test_pab_with_colours_of_a_btdf(reading):
+    data = reading("#format: theta phi BTDF\n#incident_angle 20 0\n#colorimetry: CIE-XYZ\n150 180 1 2 3\n90 0 1 1 1\n")
+    assert data.channels == ("X", "Y", "Z")
+    np.testing.assert_array_equal(data.values[0], [1, 2, 3])
+    assert data.wo[0, 2] < 0
+    np.testing.assert_array_equal(data.mask, [True, False])
+    assert "1 sample below zero, kept as measured" in reading(PAB.replace("0.009744", "-0.01")).source.notes
 
 
 HEAD = """LightTools BSDF
@@ -74,14 +99,21 @@ def test_lighttools(reading):
     np.testing.assert_allclose(data.wo[1:4], direction(30, [0, 90, 180]), atol=1e-15)
     with pytest.raises(ValueError, match="line 19: this table stands twice"):
         reading(lighttools({}, {}))
-    sides = [{"side": side, "kind": kind} for side in ("Front", "Back") for kind in ("BRDF", "BTDF")]
-    data = reading(lighttools(*sides))
+
+
+def test_sides_of_lighttools(reading):
+    data = reading(
+        lighttools(*({"side": side, "kind": kind} for side in ("Front", "Back") for kind in ("BRDF", "BTDF")))
+    )
     np.testing.assert_array_equal(np.sign(data.wi[::4, 2]), [1, 1, -1, -1])
     np.testing.assert_array_equal(np.sign(data.wo[::4, 2]), [1, -1, -1, 1])
-    colours = [
-        {"more": f"TristimulusValue Tris{name}\n", "first": value} for name, value in zip("YXZ", (2, 1, 3), strict=True)
+
+
+def test_colours_of_lighttools_in_any_order(reading):
+    tables = [
+        {"more": f"TristimulusValue Tris{name}\n", "first": value} for name, value in (("Y", 2), ("X", 1), ("Z", 3))
     ]
-    data = reading(lighttools(*colours, spectrum="XYZ"), quantity="reflectance_factor")
+    data = reading(lighttools(*tables, spectrum="XYZ"), quantity="reflectance_factor")
     assert data.channels == ("X", "Y", "Z")
     np.testing.assert_allclose(data.values[0] * np.pi, [1, 2, 3])
 

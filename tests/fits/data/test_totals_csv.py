@@ -57,6 +57,13 @@ def test_a_bsdf_beside_a_column_of_totals_is_a_bsdf(reading):
 
 def test_what_would_not_come_back_is_not_written(tmp_path):
     turned = replace(Totals.of([30, 30], reflectance=0.3), wi=direction(30, [180, 90]))
-    with pytest.raises(ValueError, match="several azimuths at 30 degrees"):
-        write_csv(turned, tmp_path / "new.csv")
+    for totals, message in (
+        (turned, "several azimuths at 30 degrees"),
+        (Totals.of(reflectance=0.1, channels=("a_std",)), "'a_std' of a channel would not come back"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            write_csv(totals, tmp_path / "new.csv")
     assert not list(tmp_path.iterdir())
+    write_csv(Totals.of(reflectance=0.1), tmp_path / "new.csv")
+    with pytest.raises(ValueError, match="exists"):
+        write_csv(Totals.of(reflectance=0.2), tmp_path / "new.csv")

@@ -3,6 +3,8 @@
 Matrices of WINDOW are read beside what is written, in `tests/fits/exports/test_klems.py`.
 """
 
+import tracemalloc
+
 import numpy as np
 import pytest
 
@@ -33,7 +35,7 @@ def xml(rank, *blocks):
 
 @pytest.mark.parametrize(("kind", "text"), [("klems", MATRIX), ("tensortree", xml(3, ("{0.25}", {})))])
 def test_what_stands_before_is_no_part_of_it(reading, kind, text):
-    for before in ("written by a laboratory\n# of <us>\n", "<!-- genBSDF -n 4 -->\n", "\ufeff\n\n"):
+    for before in ("", "written by a laboratory\n", "# of <us>\n", "<!-- genBSDF -n 4 -->\n", "\n\n", "\ufeff\n\n"):
         for encoding in ("utf-8", "utf-16"):
             data = reading((before + text).encode(encoding))
             assert data.source.format == kind
@@ -43,8 +45,12 @@ def test_what_stands_before_is_no_part_of_it(reading, kind, text):
 def test_rings_stand_for_no_more_patches_than_there_may_be(reading):
     ring = MATRIX[MATRIX.index("<AngleBasisBlock>") : MATRIX.index("</AngleBasis>")]
     many = 20_000 * ring.replace("<nPhis>1<", "<nPhis>2000<")
+    tracemalloc.start()
     with pytest.raises(ValueError, match="two: 4000 patches or more, must be 2000 at most"):
         reading(MATRIX.replace("<AngleBasisBlock>", f"{many}<AngleBasisBlock>", 1))
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 200e6  # 40 million patches would take a GB
 
 
 # ---- trees of tensors ----
@@ -67,6 +73,23 @@ def test_boxes_by_hand():
     ):
         assert at[low] == expected
     np.testing.assert_array_equal(look_up(tree, found.low + 0.5 * found.edge[:, None]), found.values)
+
+
+def test_nodes_of_equal_grids_become_one():
+    grid = parse("{ {1} {2} {3} {4} {5} {6} {7} {8} }", 3)
+    assert grid.shape == (2, 2, 2)
+    assert (grid[1, 0, 0], grid[0, 1, 0], grid[0, 0, 1]) == (2.0, 3.0, 5.0)
+    nodes = (" ".join(str(10 * node + place) for place in range(8)) for node in range(8))
+    twice = parse("{" + " ".join(f"{{ {node} }}" for node in nodes) + "}", 3)
+    assert twice.shape == (4, 4, 4)
+    assert twice[2, 1, 3] == 10 * 5 + 3  # node: first and last axis above the middle, 1 + 4; in it 0, 1, 1
+
+
+def test_a_million_values_in_seconds():
+    node = "{" + f"{{{' '.join(['0.123456'] * 16)}}} " * 16 + "}"
+    for _ in range(3):
+        node = "{" + node * 16 + "}"
+    assert boxes(parse(node, 4), 4).values.size == 16**5
 
 
 def test_the_disk_has_the_area_of_the_square():

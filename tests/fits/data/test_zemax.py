@@ -121,3 +121,17 @@ def test_channels_rotations_and_quantity(zemax):
     quarter_turn = np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 1]])  # the whole geometry turns by -90 degrees
     np.testing.assert_allclose(data.wo[8:], data.wo[:8] @ quarter_turn.T, atol=1e-15)
     assert data.source.quantity == "reflectance_factor"
+
+
+@pytest.mark.parametrize("symmetry", ["PlaneSymmetrical", "ASymmetrical", "Asymmetrical4D"])
+def test_all_symmetries_are_read_as_they_stand(zemax, symmetry):
+    """Two rotations of the sample, azimuths beyond 180: the light turns by the rotation, the lobe with it."""
+    changes = [("PlaneSymmetrical", symmetry), ("1\n0\n", "2\n0 30\n"), ("0 90 180", "0 120 240"), (BLOCK, BLOCK * 2)]
+    data = zemax(*changes)
+    assert len(data) == 16
+    np.testing.assert_allclose(data.phi_i, np.repeat([180, 150], 8))
+    np.testing.assert_allclose(data.theta_o[:8], data.theta_o[8:])
+    np.testing.assert_allclose((data.phi_o[:8] - data.phi_o[8:]) % 360, 30)
+    # azimuths 120 and 240 lie on either side of the plane of incidence
+    np.testing.assert_allclose(data.wo[2] * [1, -1, 1], data.wo[3], atol=1e-12)
+    assert abs(data.wo[2, 1]) > 0.3

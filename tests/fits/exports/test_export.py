@@ -6,9 +6,12 @@ import pytest
 import fits
 import layerjax as lj
 from fits.cli.parser import main
+from fits.data.formats._square import Interpolation
 from fits.data.formats.rgl_table import read_table
+from fits.exports import merl
 from fits.exports.contents import pairs
 from fits.exports.export import ENDINGS
+from fits.exports.material import Material, material_of
 from tests.helpers.commands import refused
 from tests.helpers.merl import centre_pairs
 
@@ -72,11 +75,21 @@ def test_an_rgl_file_holds_the_stack(tmp_path, stack, transport, share, azimuths
 @pytest.mark.parametrize(
     ("phase", "median", "most"),
     [
+        (lj.SGGX("fiber", 0.3, LYING), 0.002, 0.023),
         (lj.SGGX("fiber", 0.1, LYING), 0.009, 0.18),
         (lj.HenyeyGreenstein(-0.9), 0.0024, 0.085),
-        pytest.param(lj.SGGX("surface", 0.1, (0.3, 0.2, 0.9)), 0.004, 0.039, marks=pytest.mark.slow),
+        *(
+            pytest.param(*row, marks=pytest.mark.slow)
+            for row in (
+                (lj.SGGX("fiber", 0.5, LYING), 0.001, 0.013),
+                (lj.SGGX("fiber", 0.05, LYING), 0.021, 0.6),
+                (lj.SGGX("surface", 0.3, (0.3, 0.2, 0.9)), 0.002, 0.012),
+                (lj.SGGX("surface", 0.1, (0.3, 0.2, 0.9)), 0.004, 0.039),
+                (lj.HenyeyGreenstein(0.9), 0.001, 0.007),
+            )
+        ),
     ],
-    ids=["fibers", "backward", "flakes"],
+    ids=lambda value: repr(value) if isinstance(value, lj.PhaseFunction) else "",
 )
 def test_narrow_lobes_are_held_as_well_as_the_page_says(tmp_path, phase, median, most):
     """Of lobes that are not about the mirror direction: the figures of docs/formats.md, to what they are rounded to."""
@@ -90,11 +103,32 @@ def test_narrow_lobes_are_held_as_well_as_the_page_says(tmp_path, phase, median,
     assert 0.5 * most < np.quantile(error, 0.99) < 1.05 * most
 
 
-def test_a_spectral_file_has_its_wavelengths(tmp_path):
+def test_a_spectral_file_has_its_wavelengths_and_is_drawn_from_as_light_goes(tmp_path):
     path, _ = written(METAL, tmp_path, "rgl", transport=lj.SingleScattering(), wavelengths=[450, 550, 650])
-    data = fits.read(path, bins=100)
+    data, table = fits.read(path, bins=100), read_table(path)
     assert data.channels == ("450 nm", "550 nm", "650 nm")
     agrees(data, METAL, lj.SingleScattering(), 2e-5)
+    # luminance times the density of half vectors, over f cos: one number for each direction of the light
+    _, theta_i, theta_m, phi_m = table.nodes()
+    place = len(theta_i) // 2
+    row, column = np.meshgrid(np.arange(2, 94, 7), np.arange(2, 94, 7), indexing="ij")
+    at = (place, row, column)
+    theta, phi = theta_m[at], phi_m[at]
+    facing = np.sin(theta_i[place]) * np.sin(theta) * np.cos(phi) + np.cos(theta_i[place]) * np.cos(theta)
+    above = 2 * facing * np.cos(theta) - np.cos(theta_i[place]) > 0.05
+    u = np.sqrt(theta * 2 / np.pi)
+    _, _, density = table.density.undrawn(u.ravel(), ((phi + np.pi) / 2 / np.pi).ravel(), _only(place, u.size))
+    jacobian = 2 * np.pi**2 * u * np.sin(theta) * 4 * facing
+    drawn = table.luminance[0, place][row, column] * density.reshape(u.shape) / jacobian
+    factor = table.factor(theta.ravel(), phi.ravel(), np.full(u.size, theta_i[place]), np.zeros(u.size))
+    light = table.values[0, place].mean(axis=0)[row, column] * factor.reshape(u.shape)
+    ratio = (drawn / light)[above]
+    assert above.sum() > 50
+    np.testing.assert_allclose(ratio, np.median(ratio), rtol=0.02)
+
+
+def _only(table, count):
+    return Interpolation(np.full((count, 1), table), np.ones((count, 1)))
 
 
 def test_a_merl_table_holds_the_stack_at_its_bins(tmp_path):
@@ -108,6 +142,13 @@ def test_a_merl_table_holds_the_stack_at_its_bins(tmp_path):
     np.testing.assert_allclose(stored, true, rtol=1e-9)
     agrees(fits.read(path), METAL, lj.SingleScattering(), 1e-9)
     assert any("in the median" in note for note in notes)
+    assert not any("passes through" in note for note in notes)
+
+
+def test_a_merl_table_says_that_light_passes(monkeypatch):
+    monkeypatch.setattr(Material, "values", lambda self, wi, wo, stage="": np.ones((len(wi), 3)))
+    notes = merl.contents(material_of(HAZE, lj.SingleScattering())).notes
+    assert any("transmission is omitted" in note for note in notes)
 
 
 @pytest.mark.parametrize(
@@ -153,6 +194,8 @@ TWO = lj.Stack([], lj.Lambertian([0.1, 0.2]))
         (METAL, "x.bsdf", "merl", {}, "must end in .binary"),
         (TILTED, "x.binary", "merl", {}, "an axis in this stack is not the normal"),
         (TWO, "x.bsdf", "rgl", {}, "this stack has 2 channels: give"),
+        (TWO, "x.binary", "merl", {}, "has 2 channels"),
+        (TWO, "x.bsdf", "zemax", {}, "this stack has 2"),
         (METAL, "x.bsdf", "rgl", {"wavelengths": [450, 550]}, "2 given, must be one for each of 3"),
         (METAL, "x.bsdf", "rgl", {"wavelengths": [650, 550, 450]}, "must be above 0 and ascend"),
         (METAL, "x.bsdf", "zemax", {"wavelengths": [450, 550, 650]}, "a file for 'zemax' has none"),

@@ -125,8 +125,13 @@ FAULTS = (
     (b"</WindowElement>", b"</WindowElemen>", "not well-formed XML"),
     (b"WindowElement", b"Drawing", "an XML file of <Drawing>"),
     (b">Columns<", b">TensorTree5<", "IncidentDataStructure is 'tensortree5'"),
+    (b"<RowAngleBasis>LBNL", b"<RowAngleBasis>LBL", "RowAngleBasis is"),
+    (b"<nPhis>8<", b"<nPhis>7<", "must be 144 x 144"),
     (b"<UpperTheta>15<", b"<UpperTheta>150<", "a ring from 5 to 150 degrees"),
+    (b"<UpperTheta>15<", b"<UpperTheta>x<", "ThetaBounds/UpperTheta is 'x', must be a number"),
+    (b"Reflection Front", b"Reflection Left", "WavelengthDataDirection is 'reflection left'"),
     (b">Visible<", b">Solar<", "no WavelengthData of 'Visible'"),
+    (b"e-01,", b"e-x1,", "could not convert"),
     (b"2.546479e-01,", b"inf,", "holds inf, must be finite"),
 )
 
@@ -146,3 +151,13 @@ def test_what_is_wrong_is_named(tmp_path, grey):
         with pytest.raises(ValueError, match=message) as error:
             fits.read(bad)
         assert str(error.value).startswith(f"{bad}: ")
+
+
+def test_blocks_that_the_visible_lacks_are_left_out(tmp_path, grey):
+    start, end = grey.index(b"<WavelengthData>"), grey.index(b"</WavelengthData>") + len(b"</WavelengthData>")
+    more = grey[start:end].replace(b">Visible<", b">CIE-X<").replace(b"Reflection Front", b"Reflection Back")
+    path = tmp_path / "two.xml"
+    path.write_bytes(grey[:end] + more + grey[end:])
+    data = fits.read(path)
+    assert len(data) == 145**2
+    assert data.source.notes[-1] == "skipped: X, the blocks are not those of the visible"

@@ -7,6 +7,7 @@ import pytest
 from scipy.optimize import least_squares
 
 import layerjax as lj
+from benchmarks.measuring.repeats import fit_many
 from fits.data.geometry import slices
 from fits.optimise.fit import fit, start_points
 from fits.optimise.levenberg_marquardt import COST_TOLERANCE
@@ -69,6 +70,18 @@ def test_the_lobe_fit_is_scipys(lobe_fit):
     other = fit(LOBE_STACK, noisy_lobe(1), transport=lobe, starts=2, seed=3)
     assert _program(True)._cache_size() == before
     assert other.values != lobe_fit.values
+
+
+def test_repeats_scatter_as_their_errors_say():
+    """Pulls of 64 repeats have mean 0 and deviation 1, within 4 standard errors of those: 0.5 and 0.35."""
+    problem = Problem(LOBE_STACK, noisy_lobe(0), lobe)
+    values = np.stack([noisy_lobe(seed).values for seed in range(64)])
+    repeats = fit_many(problem, values, starts=4)
+    truth = np.array([LOBE[name.strip("[']")] for name in problem.names])
+    pulls = (repeats.vectors - truth) / repeats.standard_errors
+    assert repeats.converged.all()
+    assert np.all(np.abs(pulls.mean(axis=0)) < 0.5)
+    assert np.all(np.abs(pulls.std(axis=0) - 1.0) < 0.35)
 
 
 def test_the_gradient_of_the_posterior_agrees_with_differences():

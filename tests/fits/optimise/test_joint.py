@@ -2,6 +2,8 @@
 
 from dataclasses import replace
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -19,7 +21,7 @@ from fits.problem.problem import Joint, Problem
 from fits.reports.results import save_fit
 from fits.sampling.posterior import Posterior
 from fits.sampling.sample import sample
-from tests.helpers.models import LINE, design, line, measured
+from tests.helpers.models import LINE, LOBE_STACK, design, line, lobe, measured, noisy_lobe
 
 SIGMA = {"first": 0.05, "second": 0.02}
 COUNTS = {"first": 100, "second": 40}
@@ -118,6 +120,15 @@ def test_what_takes_the_other_of_whole_and_part(joint):
     assert first.scale == 1.0
 
 
+def test_a_part_predicts_with_what_all_of_them_say(joint):
+    at = slices(incidence=(10,))
+    seen = predict(joint.part("first"), at, draws=4000)
+    columns = np.stack([at.wo[:, 2], np.ones(len(at)), np.zeros(len(at))], axis=-1)
+    _, covariance = least_squares(prior=False)
+    sd = np.sqrt(np.sum(columns @ covariance * columns, axis=-1))
+    np.testing.assert_allclose(seen.sd[:, 0], sd, rtol=0.06)  # of 4000 draws by weight
+
+
 def test_the_posterior_is_that_of_all(joint):
     found = sample(joint, ess=1000, seed=1)
     expected, covariance = least_squares(prior=False)
@@ -157,6 +168,30 @@ def test_what_is_new_in_one_measurement_is_not_shared():
     added = set(changed.names) - set(both.names)
     assert len(added) == 4
     assert all(name.startswith("first.noise.discrepancy.") for name in added)
+
+
+def test_each_measurement_is_differentiated_by_its_own_parameters():
+    """By counts of operations: a Jacobian of three costs the sum of theirs."""
+
+    def dear(stack, wi, wo):
+        return sum(lobe(stack | {"gain": stack["gain"] * share}, wi, wo) for share in (0.05, 0.1, 0.15, 0.2))
+
+    alone = Problem(LOBE_STACK, noisy_lobe(0), dear)
+    several = Joint(dict.fromkeys(("a", "b", "c"), alone), shared=["['alpha']"])
+
+    def jacobian(model):
+        def value(vector):
+            (data, *_), _ = model.linear_parts(vector)
+            return data
+
+        return lambda x: jax.vmap(lambda t: jax.jvp(value, (x,), (t,))[1])(jnp.eye(x.size))
+
+    def flops(problem):
+        program = jax.jit(jacobian(problem.model)).lower(jnp.asarray(problem.start))
+        return program.cost_analysis()["flops"]
+
+    assert len(several.names) == 16
+    assert flops(several) < 1.2 * 3 * flops(alone)
 
 
 FIRST, SECOND = (problem(name) for name in TRUE)

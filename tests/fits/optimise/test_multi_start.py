@@ -18,7 +18,7 @@ from fits.problem.parameters import Free, LogUniform
 from fits.problem.problem import Problem
 from fits.problem.simulate import simulate
 from fits.problem.stack_file import read_problem
-from tests.helpers.models import LINE, LOBE, LOBE_STACK, directions, line, line_data, lobe, measured
+from tests.helpers.models import LINE, LOBE, LOBE_STACK, directions, line, line_data, lobe, measured, noisy_lobe
 from tests.helpers.places import EXAMPLES
 
 COATINGS = EXAMPLES / "arizona_black_coatings"
@@ -76,6 +76,17 @@ def test_the_lowest_end_is_the_fit_though_it_ran_out_of_steps(monkeypatch):
     assert result.minima[0].cost <= seen * (1 + 1e-5)
     assert sum(result.start_outcomes.values()) == 6
     assert set(result.start_outcomes) <= set(OUTCOMES)
+
+
+def test_a_start_that_ran_out_of_steps_goes_on(monkeypatch):
+    """Two steps a round, and as many rounds as it takes: the same minimum."""
+    monkeypatch.setattr(starts_module, "MOST_STEPS", 2)
+    monkeypatch.setattr(starts_module, "MOST_ROUNDS", 200)
+    slowly = fit(LOBE_STACK, noisy_lobe(0), transport=lambda *a: lobe(*a), starts=1)
+    monkeypatch.undo()
+    at_once = fit(LOBE_STACK, noisy_lobe(0), transport=lobe, starts=1)
+    assert slowly.converged
+    assert slowly.minima[0].cost == pytest.approx(at_once.minima[0].cost, abs=LEAST_GAIN)
 
 
 class Dimmed:

@@ -147,6 +147,17 @@ def test_modes_are_refined_alone_where_nodes_will_do(monkeypatch):
     assert error <= DEFAULT.numerical_error
 
 
+def test_what_is_given_in_part_stays():
+    given = lj.AddingDoubling(modes=4)
+    chosen = lj.AddingDoubling(nodes=12, modes=4, ordinates=(6, 8))
+    known = resolution_module.Resolutions(given, chosen, tilted=False)
+    assert known.open
+    assert known.in_words(known.finer(chosen)) == "16 nodes, 4 modes"
+    tilted = resolution_module.Resolutions(lj.AddingDoubling(nodes=8, modes=8), chosen, tilted=True)
+    assert tilted.open
+    assert tilted.in_words(tilted.finer(chosen)) == "8 cosines, 12 azimuths"
+
+
 def test_errors_count_in_fitted_noise_levels_or_the_scatter_about_a_named_objective():
     data = line_data()
     level = Problem(LINE, data, line, Noise(floor=Free(0.05, 0.01, 1.0), use_sigma=False))

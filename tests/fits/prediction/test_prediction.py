@@ -70,6 +70,20 @@ def test_intervals_of_a_line_are_those_of_regression(found: Fit) -> None:
         assert (UNRELIABLE in scores_table(one, found.problem.data, "").note) == unreliable
 
 
+@pytest.mark.slow
+def test_wrong_models_need_a_discrepancy() -> None:
+    """Of 10 sets whose model is wrong by 10 %: intervals cover what they say, those of independent noise do not."""
+    sets = [split(measurements(seed, 0.1)) for seed in range(10)]
+    with_it, alone = (
+        [predict(fitted_to(fitted, discrepancy), held_out).scores for fitted, held_out in sets]
+        for discrepancy in (True, False)
+    )
+    # 82 held-out measurements a set are correlated: the standard error of the mean of 10 sets is about 0.03
+    assert 0.86 < np.mean([one.coverage[0.95] for one in with_it]) < 0.99
+    assert np.mean([one.coverage[0.95] for one in alone]) < 0.7
+    assert np.mean([one.elpd - other.elpd for one, other in zip(with_it, alone, strict=True)]) > 1.0
+
+
 def test_quantiles_are_those_of_the_draws() -> None:
     fitted, held_out = split(measurements(3, 0.1))
     at = predict(fitted_to(fitted), held_out)
@@ -108,12 +122,43 @@ def test_thirty_held_out_measurements_lie_within_what_is_predicted_and_not_withi
     assert at.scores.coverage[0.95] >= 27 / 30
 
 
+@pytest.mark.slow
+def test_what_is_predicted_first_is_the_bsdf_and_not_the_stack_alone() -> None:
+    """The truth is known: a stack that is wrong by 10 %, smoothly in angle. Its intervals hold that, 95 of 100."""
+    inside: dict[str, list[float]] = {"bsdf": [], "latent": []}
+    closer = []
+    for seed in range(2):
+        fitted, _ = split(measurements(seed, 0.1))
+        _, truth = split(measurements(seed, 0.1, sigma=0.0))  # the discrepancy is drawn before the noise
+        at = predict(fitted_to(fitted), truth)
+        exact = truth.used().values
+        for name, held in inside.items():
+            interval = getattr(at, name)
+            held.append(float(np.mean((interval.quantiles[0] < exact) & (exact < interval.quantiles[-1]))))
+        # a measurement adds independent noise: of the logarithm, which is the relative deviation here
+        np.testing.assert_allclose(at.scales**2, at.discrepancy_sd**2 + SIGMA**2, rtol=1e-3)
+        closer.append(np.median(np.abs(at.mean / exact - 1.0)) / np.median(np.abs(at.latent.mean / exact - 1.0)))
+    # neighbours are correlated: 82 count as some ten, whose share scatters by 0.07, the mean of 2 by 0.05
+    assert np.mean(inside["bsdf"]) > 0.85
+    assert np.mean(inside["latent"]) < 0.7
+    assert np.mean(closer) < 0.9
+
+
 def test_directions_below_an_opaque_stack_are_refused(coat_fit: Fit) -> None:
     """There is nothing to see: whatever number stands there is made up."""
     for at in (slices([95.0]), slices([90.0]), slices([30.0], [10.0, 120.0])):
         with pytest.raises(ValueError, match=r"sees nothing of an opaque stack; its polar angle must be in \[0, 90\)"):
             predict(coat_fit, at)
     assert np.all(predict(coat_fit, slices([89.9]), draws=8).mean > 0.0)
+
+
+def test_right_models_lose_little_by_it() -> None:
+    fitted, held_out = split(measurements(1, 0.0))
+    found = fitted_to(fitted)
+    assert found.values["noise.discrepancy.amplitude"] < SIGMA
+    got = predict(found, held_out).scores
+    assert got.coverage[0.95] > 0.9
+    assert got.median_error < SIGMA
 
 
 def test_noise_elsewhere_is_that_of_what_was_fitted() -> None:

@@ -1,6 +1,7 @@
 """What a notebook shows of results: their numbers, reservations, and no word as HTML."""
 
 import xml.etree.ElementTree as ET
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -39,6 +40,15 @@ def test_a_fit_is_its_verdict_and_its_values(coat_fit: Fit) -> None:
         assert float(row[2]) == pytest.approx(coat_fit.standard_errors[row[0]], rel=0.05)
     assert found[1][4] == "0 to 1"
     assert f"reduced chi-square {coat_fit.reduced_chi_square:.3g}" in text(shown)
+
+
+def test_what_is_not_identified_is_named(result: Fit) -> None:
+    direction = fits.Direction(float("inf"), {A: 0.8, B: -0.6}, {A: 0.1, B: 0.2})
+    case = replace(result, at_bound=(A,), errors=np.array([np.nan, 0.1]), unidentified=(direction,))
+    shown = case._repr_html_()
+    assert {row[0]: row[2] for row in rows(shown)}[A] == "unknown"
+    assert f"{A} and {B} are not identified separately; {A} is at a bound." in text(shown)
+    assert any(row[2:4] == ["unidentified", f"+0.8 {A}, -0.6 {B}"] for row in rows(shown))
 
 
 def test_a_posterior_has_estimates_only_if_its_chain_is_long_enough(result: Fit) -> None:

@@ -107,6 +107,12 @@ def test_a_transport_that_has_no_name_is_refused(coat_fit: Fit, tmp_path: Path) 
     assert not list(tmp_path.iterdir())
 
 
+def test_one_of_several_measurements_is_not_sampled_by_itself_where_it_was_saved(coat_fit: Fit, tmp_path: Path) -> None:
+    save_fit(replace(coat_fit, dataset="plane"), tmp_path / "fit")
+    with pytest.raises(ValueError, match="sample: 'plane' is a part of a joint fit"):
+        sample(load_fit(tmp_path / "fit"))
+
+
 # ---- posteriors ----
 
 
@@ -138,6 +144,21 @@ def damaged(content: bytes, step: int) -> Iterator[bytes]:
         for other in (bytes(len(run)), bytes(255 - byte for byte in run)):
             if other != run:
                 yield content[:place] + other + content[place + 64 :]
+
+
+def test_damage_to_a_chain_is_seen(result: Fit, tmp_path: Path) -> None:
+    """Wherever it matters: some bytes of a page of SQLite are of no use."""
+    path, refused = tmp_path / "chain.db", 0
+    sample(result, walkers=16, seed=1, max_steps=100, path=path)
+    whole, posterior = path.read_bytes(), load(result, path)
+    copies = [*damaged(whole, 4096), whole[:100], whole[:-1]]
+    for bad in copies:
+        path.write_bytes(bad)
+        try:
+            np.testing.assert_array_equal(load(result, path).chain, posterior.chain)
+        except ValueError as error:
+            refused += "chain.db: damaged" in str(error)
+    assert refused > 0.8 * len(copies)
 
 
 def test_damage_to_a_result_is_seen(coat_fit: Fit, tmp_path: Path) -> None:
