@@ -174,7 +174,8 @@ def select(data: Pairs, words: str) -> Rows:
     """
     name, equals, text = words.partition("=")
     if not equals or name not in ("incidence", "azimuth", "theta_o"):
-        raise ValueError(f"{words!r} is no selection; it must be one of incidence=..., azimuth=..., theta_o=...")
+        known = "incidence=..., azimuth=..., theta_o=..., or channels=... in --select"
+        raise ValueError(f"{words!r} is no selection; it must be one of {known}")
     low, colon, high = text.partition(":")
     try:
         angles: Any = slice(float(low), float(high)) if colon else [float(word) for word in text.split(",")]
@@ -189,7 +190,8 @@ def _at(measured: NDArray[np.float64], name: str, angles: Angles, turn: float = 
         low = -math.inf if angles.start is None else angles.start - SAME_ANGLE
         high = math.inf if angles.stop is None else angles.stop + SAME_ANGLE
         if angles.step is not None or not low <= high:
-            raise ValueError(f"{name} is {angles}; it must be slice(low, high), the first not above the second")
+            given = f"{angles.start}:{angles.stop}" + ("" if angles.step is None else f":{angles.step}")
+            raise ValueError(f"{name} is {given}; it must be two angles, the first not above the second")
         return (measured >= low) & (measured <= high)
     chosen = np.zeros(len(measured), bool)
     for angle in np.atleast_1d(np.asarray(angles, float)):

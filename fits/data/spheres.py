@@ -39,7 +39,8 @@ class Sphere:
             value = getattr(self, field.name)
             below = {"diameter": math.inf, "wall": 1.0, "detector_reflectance": 1.0}.get(field.name, self.diameter)
             if not (isinstance(value, Real) and 0.0 <= float(value) < below) or (field.name, value) == ("diameter", 0):
-                raise ValueError(f"Sphere.{field.name} is {value!r:.60}, must be a number in [0, {below:g})")
+                bracket = "(" if field.name == "diameter" else "["
+                raise ValueError(f"Sphere.{field.name} is {value!r:.60}, must be a number in {bracket}0, {below:g})")
         if sum(self.area_fraction(port) for port in ("sample", "entrance", "detector")) >= 1.0:
             raise ValueError("Sphere: the ports cover the whole wall")
 

@@ -154,7 +154,13 @@ def _notes(rows: list[ComparedFit], options: ComparisonOptions) -> list[str]:
     notes = []
     for what in ("noise", "transport", "scale"):
         settings = {row.name: repr(getattr(row.fit.problem, what)) for row in rows}
-        if len(set(settings.values())) > 1:
+        if len(set(settings.values())) == 1:
+            continue
+        with_it = [row.name for row in rows if row.fit.problem.noise.discrepancy]
+        others = {repr(replace(row.fit.problem.noise, discrepancy=None)) for row in rows}
+        if what == "noise" and len(others) == 1 and 0 < len(with_it) < len(rows):
+            notes.append(f"of the fits only {', '.join(with_it)} with a discrepancy term")
+        else:
             notes.append(f"the fits differ in {what}: " + "; ".join(f"{name}: {one}" for name, one in settings.items()))
     if failed := [row.name for row in rows if not row.fit.converged]:
         notes.append(f"not converged: {', '.join(failed)}")
