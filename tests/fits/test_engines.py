@@ -132,7 +132,9 @@ def test_a_script_without_a_main_guard_is_refused(tmp_path):
     assert '`if __name__ == "__main__":`' in last
 
 
-@pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGKILL], ids=lambda sent: sent.name)
+@pytest.mark.parametrize(
+    "sent", [pytest.param(signal.SIGINT, marks=pytest.mark.slow), signal.SIGKILL], ids=lambda sent: sent.name
+)
 def test_workers_end_with_their_parent(tmp_path, sent):
     """While they work. Ctrl-C goes to all processes of a terminal; a parent that is killed can end nobody."""
     guard = 'if __name__ == "__main__":\n    '

@@ -109,6 +109,7 @@ def test_a_gradient_by_one_number_agrees_with_differences(number):
     same(jax.grad(function)(AT[number]), difference, 1e-6)
 
 
+@pytest.mark.slow
 def test_derivatives_of_derivatives(ruled):
     """One within the other, and twice by one number, are as within jit."""
 
@@ -230,11 +231,16 @@ def test_of_other_transports_all_is_traced(ruled):
 
 
 def test_another_stack_finds_its_interface_compiled():
+    wi, wo = (jnp.asarray(w, jnp.float32) for w in (WI, WO))
+
+    def value(stack):
+        return lj.evaluate(jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), stack), wi, wo, TRANSPORT)
+
     def gradient(stack):
-        return eqx.filter_grad(lambda stack: jnp.sum(lj.evaluate(stack, WI, WO, TRANSPORT)))(stack)
+        return eqx.filter_grad(lambda stack: jnp.sum(value(stack)))(stack)
 
     interface, haze = lj.Interface(1.5, 0.2), lj.Medium(0.7, 0.9, lj.HenyeyGreenstein(0.5))
-    for call in (lambda stack: lj.evaluate(stack, WI, WO, TRANSPORT), gradient):
+    for call in (value, gradient):
         call(lj.Stack([interface, haze], lj.Lambertian(0.4)))
         others = lj.Stack([interface, haze], lj.OrenNayar(0.4, 0.3)), lj.Stack([interface], lj.Lambertian(0.4))
         for other in others:

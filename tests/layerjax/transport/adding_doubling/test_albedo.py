@@ -98,6 +98,7 @@ def test_albedo_over_metal_is_the_mean_of_walks(alpha):
     np.testing.assert_allclose(found, walks, rtol=3e-3)
 
 
+@pytest.mark.slow
 def test_albedo_of_a_narrow_lobe_and_its_slope_are_those_of_a_mirror():
     """0.0414 and, at alpha 0.003, 2 % more than 0.04 were found with 12 nodes, which do not resolve the lobe."""
 

@@ -218,6 +218,7 @@ def _rest(out: np.ndarray, into: np.ndarray) -> np.ndarray:
     return (out / np.maximum(out[:, :1], 1e-12))[:, :, None] * into[:, None, :]
 
 
+@pytest.mark.slow
 def test_the_box_is_finite_and_smooth() -> None:
     """Values and gradients at corners of alpha and index, in float32, and slopes that do not jump across cells."""
 
