@@ -119,12 +119,13 @@ COMMANDS = {
             "--pilot-texels": _one("fitted first, from many starts (default: 64)", "N", type=count, default=64),
             "--chunk-size": _one("texels a task (default: 1024)", "N", type=count, default=1024),
             "--emulator": _one(
-                "series over the bounds in place of the transport", choices=("auto", "always", "never"), default="auto"
+                "Chebyshev series in place of the transport", choices=("auto", "always", "never"), default="auto"
             ),
             "--spatial-prior": _one(
-                "of neighbouring texels: gradual, or even", choices=("gaussian", "total_variation")
+                "prior of differences between texels: gradual changes, or even areas with edges",
+                choices=("gaussian", "total_variation"),
             ),
-            "--spatial-scale": _one("of the difference between neighbours, as a share of the bounds", "X", type=level),
+            "--spatial-scale": _one("scale of these differences, as a share of the bounds", "X", type=level),
         },
         "--stack --noise --starts --seed --processes --scheduler --force",
         {
