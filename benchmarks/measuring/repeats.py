@@ -59,8 +59,8 @@ def fit_many(problem: Problem, values: ArrayLike, *, starts: int = 1, seed: int 
 
 
 def _solve_repeats(model: Model, starts: Array, values: Array) -> tuple[Array, Array, Array, Array]:
-    if model.process is not None and model.process.gram is not None:  # that of the problem's own values
-        model = replace(model, process=replace(model.process, gram=None))
+    if model.process is not None and model.process.projection is not None:  # that of the problem's own values
+        model = replace(model, process=replace(model.process, projection=None))
 
     def one(row: Array) -> tuple[Array, Array, Array, Array]:
         repeat = eqx.tree_at(lambda m: m.values, model, row)

@@ -37,6 +37,7 @@ if TYPE_CHECKING:
 
 DRAWS = 128  # draws of the posterior that held-out data are predicted with at a time, see `ComparisonOptions`
 INFINITE_NOISE = 1e8  # noise with which a measurement does not influence a fit, in units of the largest measurement
+INFINITE_ERROR = 1e3  # the same of its logarithm, beside model discrepancy
 STACKING_STEPS = 20_000  # steps of the expectation maximisation of stacking weights, at most
 
 
@@ -177,16 +178,18 @@ def without(problem: Problem, held_out: ArrayLike) -> Problem:
     """
     model, rows = problem.model, jnp.asarray(held_out)[:, None]
     infinite = INFINITE_NOISE * jnp.max(jnp.abs(model.values) + model.lowest)
+    if model.process is not None:
+        infinite = INFINITE_ERROR * size(model.values, model.softness)
     model = replace(
         model,
         variance=jnp.where(rows, infinite**2, model.variance),
         lowest=jnp.where(rows, infinite, model.lowest),
     )
-    if model.process is not None and model.process.gram is not None:
+    if model.process is not None and model.process.projection is not None:
         parts = model.build(jnp.asarray(problem.start))
         sigma = total_sigma(model.values, model.variance, parts.relative, parts.floor)
-        gram = model.process.gram_of(size(model.values, model.softness) / sigma)
-        model = replace(model, process=replace(model.process, gram=gram))
+        projection = model.process.project(size(model.values, model.softness) / sigma)
+        model = replace(model, process=replace(model.process, projection=projection))
     return problem.with_model(model)
 
 

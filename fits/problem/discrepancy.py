@@ -9,10 +9,13 @@ process lives on inducing points, and costs a matrix of as many rows: the places
 few, else of some, on which the others are regressed. Noise is that of the datum, so that the covariance does not depend
 on the model, and most of its derivatives vanish.
 
-The negative log-density of all measurements is half a sum of squares again, up to a constant: with A from white numbers
-c to errors in standard deviations of the noise, z the residuals, and B = 1 + A'A = C C',
+What N measurements say of the errors at the inducing points is what their least squares y say, whose covariance by the
+noise alone is G^-1. With residuals z and errors W u of measurements in standard deviations of the noise, G = W'W, K the
+covariance of u, and S = G^-1 + K that of y, the negative log-density is half a sum of squares again, up to a constant:
 
-    (z'(1 + A A')^-1 z + log det (1 + A A')) / 2 = min_c (|z - A c|^2 + |c|^2) / 2 + sum log diag C.
+    z'(1 + W K W')^-1 z + log det (1 + W K W') = |z - W y|^2 + y'S^-1 y + log det S - log det G^-1.
+
+Where the noise is known G^-1 is, too, and a density costs one Cholesky decomposition of S.
 """
 
 from dataclasses import dataclass
@@ -23,7 +26,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jax.scipy.linalg import solve_triangular
+from jax.lax.linalg import cholesky
+from jax.scipy.linalg import block_diag, solve_triangular
 from numpy.typing import ArrayLike, NDArray
 
 from fits.data.geometry import Floats
@@ -207,47 +211,46 @@ def _pivots(where: Floats, reach: Floats, most: int) -> tuple[list[int], float]:
 # ---- the process ----
 
 
-class Whitened(NamedTuple):
-    """Residuals that are independent, of N measurements in C channels, with C R white numbers.
+class Projection(NamedTuple):
+    """How well the measurements by themselves tell the errors at inducing points, in each channel.
 
-    residuals: z - A c, (N, C). latent: c, (C R,). levels: the logarithms of the diagonal of B's root, (C R,), none
-    below 0.
+    covariance: G^-1 of the least squares, (C, R, R). root: its Cholesky factor, (C, R, R).
     """
 
-    residuals: Array
-    latent: Array
-    levels: Array
-
-
-class Factors(NamedTuple):
-    """Roots of the covariance of channels, (C, C), and of inducing points, (R, R), but for the amplitude; A'A, and the
-    root C of B = 1 + A'A, (C R, C R)."""
-
-    amplitude: Array
-    channels: Array
-    points: Array
-    square: Array
+    covariance: Array
     root: Array
 
 
-class Moves(NamedTuple):
-    """X of each number of a process, by which A moves by dA = A X; X + X' is the change of the covariance between white
-    numbers. Of the amplitude it is a number, of the others (K, C, C) between channels plus (K, R, R) between points."""
+class Whitened(NamedTuple):
+    """Independent residuals, of N measurements in C channels and R inducing points, as `fits.problem.discrepancy` says.
 
-    amplitude: Array
-    channels: Array
-    points: Array
+    unfitted: z - W y, (N, C). estimates: (S^-1/2) y, (C R,). levels: logarithms of the diagonal of the root of S over
+    that of G^-1, (C R,), none below 0.
+    """
+
+    unfitted: Array
+    estimates: Array
+    levels: Array
+
+
+class Regression(NamedTuple):
+    """A process beside measurements: their projection, the least-squares errors y at inducing points, (C, R), and the
+    Cholesky factor of the covariance S of y, (C R, C R)."""
+
+    projection: Projection
+    estimate: Array
+    root: Array
 
     @property
-    def transposed(self) -> "Moves":
-        """X'."""
-        return Moves(self.amplitude, self.channels.swapaxes(1, 2), self.points.swapaxes(1, 2))
+    def white(self) -> Array:
+        """The estimates as independent numbers of variance 1, (C R,)."""
+        return solve_triangular(self.root, self.estimate.reshape(-1), lower=True)
 
-    def times(self, rows: Array) -> Array:
-        """Rows (M, C R) of white numbers times X, (1 + K, M, C R)."""
-        split = rows.reshape(len(rows), self.channels.shape[-1], -1)
-        others = jnp.einsum("mcr,kcx->kmxr", split, self.channels) + jnp.einsum("mcr,krx->kmcx", split, self.points)
-        return jnp.concatenate([self.amplitude * rows[None], others.reshape(-1, *rows.shape)])
+    @property
+    def levels(self) -> Array:
+        """See `Whitened`."""
+        own = jnp.diagonal(self.projection.root, axis1=1, axis2=2)
+        return jnp.log(jnp.diagonal(self.root)) - jnp.log(own).reshape(-1)
 
 
 class Process(eqx.Module):
@@ -260,83 +263,101 @@ class Process(eqx.Module):
         weights: (N, R), from inducing points to measurements.
         shortest: (2,), what errors reach at least, in degrees of half vector and difference, so that inducing points
             carry them.
-        gram: `gram_of` measurements, (C, R, R), where their noise is known; else None.
+        projection: `project` of the measurements where their noise is known; else None.
     """
 
     where: Array
     weights: Array
     shortest: Array
-    gram: Array | None = None
+    projection: Projection | None = None
 
-    def gram_of(self, relative: Array) -> Array:
-        """What measurements say of inducing points, (C, R, R)."""
-        return jnp.stack([self.weights.T @ (column[:, None] ** 2 * self.weights) for column in relative.T])
+    def project(self, relative: Array) -> Projection:
+        """The projection of measurements on the inducing points."""
+
+        def covariance(column: Array) -> Array:
+            rows = column[:, None] * self.weights
+            scale = 1.0 / jnp.linalg.norm(rows, axis=0)
+            inverse = _triangular_inverse(_root(_with_jitter((rows * scale).T @ (rows * scale), 0.0)))
+            return scale[:, None] * (inverse.T @ inverse) * scale
+
+        found = jnp.stack([covariance(column) for column in relative.T])
+        return Projection(found, _root(found))
+
+    def regress(self, numbers: Array, z: Array, relative: Array) -> Regression:
+        """What measurements with these residuals say of errors at inducing points, beside what the process does."""
+        projection = self.project(relative) if self.projection is None else self.projection
+        estimate = _each_channel(projection.covariance, self.observed(z, relative))
+        both = block_diag(*projection.covariance) + self._covariance(numbers, relative.shape[-1])
+        return Regression(projection, estimate, _root(both))
+
+    def observed(self, z: Array, relative: Array) -> Array:
+        """W'z, (C, R)."""
+        return (relative * z).T @ self.weights
+
+    def errors(self, at_points: Array, relative: Array) -> Array:
+        """Errors of measurements, W u, (N, C), from those at inducing points, (C, R)."""
+        return relative * (self.weights @ at_points.T)
 
     def whitened(self, z: Array, relative: Array, at: Correlation) -> Whitened:
-        """What is left of residuals when the discrepancy that they imply is taken away."""
+        """Residuals as independent numbers."""
         return Whitened(*_whitened(self._numbers(at, z.shape[-1]), z, relative, process=self))
 
     def sample(self, white: Array, at: Correlation) -> Array:
         """Errors of the measurements, (N, C), from standard normal numbers (C, R)."""
-        between, own = map(jnp.linalg.cholesky, self._covariances(self._numbers(at, len(white)), len(white)))
+        between, own = map(_root, self._covariances(self._numbers(at, len(white)), len(white)))
         return at.amplitude * self.weights @ (between @ white @ own.T).T
 
     def whitened_residuals(self, z: Array, relative: Array, at: Correlation) -> Array:
-        """Residuals z (N, C) by the symmetric root of their covariance, K^-1/2 z with K = 1 + A A'.
+        """Residuals z (N, C) by the symmetric root of their covariance, K^-1/2 z with K = 1 + W S W'.
 
         Where the model holds they are independent standard normal, and their squares add up to z'K^-1 z. What is left
-        of z beside what the process explains (`whitened`) is neither: the process follows each datum, so that it is
-        smaller than 1, and negatively correlated between neighbours. Leave-one-out residuals (`leave_one_out`) have
-        variance 1, but are correlated, too.
+        of z beside what the process explains (`leave_one_out`) is neither: the process follows each datum, so that it
+        is smaller than 1, and negatively correlated between neighbours. Leave-one-out residuals have variance 1, but
+        are correlated, too.
         """
-        factors = self.factors(self._numbers(at, relative.shape[-1]), relative)
-        spread, axes = jnp.linalg.eigh(factors.square)
-        root = jnp.sqrt(1.0 + jnp.maximum(spread, 0.0))
-        explained = axes.T @ self.to_white(relative * z, factors)
-        white = -(axes @ (explained / (root * (1.0 + root))))  # ((1 + s)^-1/2 - 1) / s
-        return z + relative * self.from_white(white, factors)
+        found = self.regress(self._numbers(at, relative.shape[-1]), z, relative)
+        own = block_diag(*found.projection.root)  # W times it has orthonormal columns
+        half = solve_triangular(own, found.root, lower=True)
+        spread, axes = jnp.linalg.eigh(half @ half.T)
+        explained = (own @ axes).T @ self.observed(z, relative).reshape(-1)
+        shrunk = own @ axes @ ((1.0 / jnp.sqrt(jnp.maximum(spread, 1.0)) - 1.0) * explained)
+        return z + self.errors(shrunk.reshape(found.estimate.shape), relative)
 
-    def leave_one_out(self, whitened_data: Whitened, relative: Array, at: Correlation) -> tuple[Array, Array]:
-        """Of each measurement its weighted residual and precision, (N, C): given all others it has mean residual /
-        precision and variance 1 / precision, in units of the noise.
+    def leave_one_out(self, z: Array, relative: Array, at: Correlation) -> tuple[Array, Array]:
+        """Of each measurement its weighted residual, z less the errors that the process implies, and its precision,
+        (N, C): given all others it has mean residual / precision and variance 1 / precision, in units of the noise.
         """
-        factors = self.factors(self._numbers(at, relative.shape[-1]), relative)
-        parts = relative, factors.channels, self.weights @ factors.points
-        rows = at.amplitude * jnp.einsum("nc,cx,nr->ncxr", *parts)
-        solved = solve_triangular(factors.root, rows.reshape(relative.size, -1).T, lower=True)
-        return whitened_data.residuals, 1.0 - jnp.sum(solved**2, axis=0).reshape(relative.shape)
+        found = self.regress(self._numbers(at, relative.shape[-1]), z, relative)
+        weighted = solve_triangular(found.root, found.white, lower=True, trans=1).reshape(found.estimate.shape)
+        residuals = z + self.errors(_each_channel(found.projection.covariance, weighted) - found.estimate, relative)
+        rows = self._estimate_rows(relative, found.projection)  # of the precision: 1 - W G^-1 W' + W G^-1 S^-1 G^-1 W'
+        both = jnp.einsum("cx,crn->crxn", jnp.eye(len(rows)), rows).reshape(len(found.root), -1)
+        inside = jnp.sum(solve_triangular(found.root, both, lower=True) ** 2, axis=0).reshape(relative.shape[::-1])
+        return residuals, 1.0 - relative * jnp.einsum("crn,nr->nc", rows, self.weights) + inside.T
 
-    def predict(
-        self, whitened_data: Whitened, relative: Array, at_places: Array, at: Correlation
-    ) -> tuple[Array, Array]:
-        """Errors of the model at other `places`, given residuals that were whitened: mean and sd, (M, C)."""
-        factors = self.factors(self._numbers(at, relative.shape[-1]), relative)
-        sizes, own = (jnp.exp(at.grazing_exponent * log_scales(where)) for where in (self.where, at_places))
+    def predict(self, at_places: Array, z: Array, relative: Array, at: Correlation) -> tuple[Array, Array]:
+        """Errors of the model at other `places`, given these residuals: mean and sd, (M, C)."""
+        found = self.regress(self._numbers(at, relative.shape[-1]), z, relative)
+        between = self._covariances(self._numbers(at, relative.shape[-1]), relative.shape[-1])[0]
+        sizes, own = (at.amplitude * jnp.exp(at.grazing_exponent * log_scales(x)) for x in (self.where, at_places))
         across = sizes[:, None] * own * correlation(self.where, at_places, at.length_half, at.length_difference)
-        across = solve_triangular(factors.points, across, lower=True)
-        rows = at.amplitude * jnp.einsum("cx,rm->mcxr", factors.channels, across)
-        rows = rows.reshape(*rows.shape[:2], -1)
-        solved = solve_triangular(factors.root, rows.reshape(-1, rows.shape[-1]).T, lower=True)
-        explained = jnp.sum(rows**2, axis=-1) - jnp.sum(solved**2, axis=0).reshape(rows.shape[:2])
-        size = at.amplitude * own
-        return -rows @ whitened_data.latent, jnp.sqrt(jnp.maximum(size[:, None] ** 2 - explained, 0.0))
+        rows = jnp.einsum("cx,rm->crmx", between, across).reshape(len(found.root), -1)
+        solved = solve_triangular(found.root, rows, lower=True).reshape(-1, len(own), len(between))
+        variance = own[:, None] ** 2 - jnp.sum(solved**2, axis=0)
+        return -jnp.tensordot(found.white, solved, 1), jnp.sqrt(jnp.maximum(variance, 0.0))
 
     def information_rows(self, relative: Array, at: Correlation) -> Array:
         """Rows whose Jacobian A has in A'A the Fisher information of the measurements about the numbers of the process.
 
-        With M = 1 - B^-1 and E = X + X' (see `Moves`), it is tr(M E M E) / 2.
+        It is tr(S^-1 dS S^-1 dS) / 2.
         """
         numbers = self._numbers(at, relative.shape[-1])
         held = jax.lax.stop_gradient(numbers)
-        factors = self.factors(held, relative)
-        inverse = _triangular_inverse(factors.root)
-        moves = self.moves(held, factors)
-        sums = Moves(*(one + other for one, other in zip(moves, moves.transposed, strict=True)))
-        flat = sums.times(jnp.eye(len(inverse)) - inverse.T @ inverse)
-        information = 0.5 * jnp.einsum("kij,lji->kl", flat, flat)
+        changes = self._changes(held, _triangular_inverse(self.regress(held, relative, relative).root))
+        information = 0.5 * jnp.einsum("kij,lij->kl", changes, changes)
         scale = 1.0 / jnp.sqrt(jnp.maximum(jnp.diagonal(information), LEAST_INFORMATION))
         scaled = information * scale[:, None] * scale + LEAST_INFORMATION * jnp.eye(len(scale))
-        return jax.lax.stop_gradient(jnp.linalg.cholesky(scaled).T / scale) @ numbers
+        return jax.lax.stop_gradient(_root(scaled).T / scale) @ numbers
 
     def _numbers(self, at: Correlation, channels: int) -> Array:
         """Those of a process that matter, (4,) or (5,)."""
@@ -349,90 +370,82 @@ class Process(eqx.Module):
         own = _with_jitter(correlation(self.where, self.where, numbers[1], numbers[2]))
         return _with_jitter(together + (1.0 - together) * jnp.eye(channels)), sizes[:, None] * own * sizes
 
-    def factors(self, numbers: Array, relative: Array) -> Factors:
-        """The matrices of a process with these numbers."""
-        between, own = map(jnp.linalg.cholesky, self._covariances(numbers, relative.shape[-1]))
-        gram = self.gram_of(relative) if self.gram is None else self.gram
-        square = jnp.einsum("ri,crs,sj->cij", own, gram, own)
-        square = jnp.einsum("cx,cy,cij->xiyj", between, between, square).reshape(2 * (len(between) * len(own),))
-        square = numbers[0] ** 2 * square
-        return Factors(numbers[0], between, own, square, jnp.linalg.cholesky(square + jnp.eye(len(square))))
+    def _covariance(self, numbers: Array, channels: int) -> Array:
+        """Of errors at inducing points, (C R, C R)."""
+        return jnp.kron(*self._covariances(numbers, channels)) * numbers[0] ** 2
 
-    def from_white(self, white: Array, factors: Factors) -> Array:
-        """Errors of the measurements, (N, C), from white numbers, (C R,)."""
-        errors = factors.channels @ white.reshape(len(factors.channels), -1) @ factors.points.T
-        return self.weights @ (factors.amplitude * errors).T
+    def _changes(self, numbers: Array, inverse: Array) -> Array:
+        """S^-1/2 dS S^-1/2' by each number, (K, C R, C R); inverse: of the root of S."""
+        channels = len(inverse) // len(self.where)
+        changes = jax.jacfwd(lambda numbers: self._covariance(numbers, channels))(numbers)
+        return inverse @ jnp.moveaxis(changes, -1, 0) @ inverse.T
 
-    def to_white(self, observed: Array, factors: Factors) -> Array:
-        """The transpose of `from_white`."""
-        return factors.amplitude * (factors.channels.T @ (observed.T @ self.weights) @ factors.points).reshape(-1)
-
-    def moves(self, numbers: Array, factors: Factors) -> Moves:
-        """What the root of the covariance changes by with each number."""
-        changes = jax.jacfwd(lambda numbers: self._covariances(numbers, len(factors.channels)))(numbers)
-        halves = []
-        for root, change in zip((factors.channels, factors.points), changes, strict=True):
-            inverse = _triangular_inverse(root)
-            whole = inverse @ jnp.moveaxis(change[..., 1:], -1, 0) @ inverse.T
-            halves.append(jnp.tril(whole) - 0.5 * whole * jnp.eye(len(root)))
-        return Moves(1.0 / jnp.where(numbers[0] > 0.0, numbers[0], 1.0), *halves)
+    def _estimate_rows(self, relative: Array, projection: Projection) -> Array:
+        """G^-1 W', (C, R, N): the estimate by each measurement."""
+        return projection.covariance @ (relative[:, None] * self.weights[..., None]).T
 
 
 @eqx.filter_custom_jvp
 def _whitened(numbers: Array, z: Array, relative: Array, *, process: Process) -> tuple[Array, Array, Array]:
-    """z - A c (N, C), c (C R,) and log diag C (C R,). Where the noise is known `relative` depends on no parameter."""
-    factors = process.factors(numbers, relative)
-    half = solve_triangular(factors.root, process.to_white(relative * z, factors), lower=True)
-    white = solve_triangular(factors.root, half, lower=True, trans=1)
-    return z - relative * process.from_white(white, factors), white, jnp.log(jnp.diagonal(factors.root))
+    """What `Whitened` holds. Where the noise is known `relative` depends on no parameter."""
+    found = process.regress(numbers, z, relative)
+    return z - process.errors(found.estimate, relative), found.white, found.levels
 
 
 @_whitened.def_jvp
 def _(primals: tuple[Any, ...], tangents: tuple[Any, ...], *, process: Process) -> tuple[Any, Any]:
-    """In closed form: with X as in `Moves` and c = B^-1 A'z,
+    """In closed form: with X = S^-1/2 dS S^-1/2', and L(X) its lower triangle with half of its diagonal,
 
-        dc = B^-1 (X + X') c - X c,    d(A c) = A B^-1 (X + X') c,    d log diag C = diag(C^-1 (B - 1) X C'^-1).
+        d(S^-1/2 y) = S^-1/2 dy - L(X) S^-1/2 y,    d log diag S^1/2 = diag X / 2.
 
-    So a Jacobian by many parameters makes matrices for the few numbers of the process alone: it is twice as fast.
+    So a Jacobian by many parameters makes matrices for the few numbers of the process alone. Noise that is fitted
+    changes `relative` by shares s: dW = s W, dy = G^-1 W'(s (z - 2 W y)), dG^-1 = -2 G^-1 W's W G^-1.
     """
     numbers, z, relative = primals
     by_numbers, by_z, by_relative = (
         jnp.zeros_like(one) if tangent is None else tangent for one, tangent in zip(primals, tangents, strict=True)
     )
-    factors = process.factors(numbers, relative)
-    inverse, moves = _triangular_inverse(factors.root), process.moves(numbers, factors)
+    found = process.regress(numbers, z, relative)
+    inverse, fitted = _triangular_inverse(found.root), process.errors(found.estimate, relative)
+    white, unfitted, own = inverse @ found.estimate.reshape(-1), z - fitted, found.projection
+    changes = process._changes(numbers, inverse)
+    halves = 0.5 * jnp.diagonal(changes, axis1=1, axis2=2)
+    moved = (jnp.tril(changes) @ white) - halves * white
 
-    def solved(x: Array) -> Array:
-        return inverse.T @ (inverse @ x)
+    shares = by_relative / relative if process.projection is None else jnp.zeros_like(z)
+    by_estimate = _each_channel(own.covariance, process.observed(by_z + shares * (unfitted - fitted), relative))
+    by_unfitted = by_z - shares * fitted - process.errors(by_estimate, relative)
+    by_white, by_levels = inverse @ by_estimate.reshape(-1) - by_numbers @ moved, by_numbers @ halves
+    if process.projection is None:
+        rows = process._estimate_rows(relative, own)
+        alone = solve_triangular(own.root, rows, lower=True)
+        rows = jnp.einsum("mcr,crn->mcn", inverse.reshape(len(inverse), *found.estimate.shape), rows)
+        weighted = rows * white[:, None, None]
+        below = jnp.cumsum(weighted, axis=0) - 0.5 * weighted
+        by_white = by_white + 2.0 * jnp.einsum("mcn,mcn,nc->m", rows, below, shares)
+        by_levels = by_levels - jnp.einsum("mcn,nc->m", rows**2, shares)
+        by_levels = by_levels + jnp.einsum("crn,nc->cr", alone**2, shares).reshape(-1)
+    return (unfitted, white, found.levels), (by_unfitted, by_white, by_levels)
 
-    white = solved(process.to_white(relative * z, factors))
-    discrepancy = process.from_white(white, factors)
-    left = z - relative * discrepancy
-    moved, pulled = (one.times(white[None])[:, 0] for one in (moves.transposed, moves))
-    sums = solved((moved + pulled).T).T
-    levels = jnp.sum(moves.times(factors.root.T - inverse) * inverse, axis=-1)  # C^-1 (B - 1) = C' - C^-1
 
-    by_levels, observed, by_discrepancy = by_numbers @ levels, relative * by_z, jnp.zeros_like(z)
-    if process.gram is None:
-        by_discrepancy = by_relative * discrepancy
-        observed = observed + by_relative * left - relative * by_discrepancy
-        parts = inverse.reshape(len(inverse), len(factors.channels), -1), factors.channels
-        seen = factors.amplitude * jnp.einsum("mcr,dc,nr->mnd", *parts, process.weights @ factors.points)
-        by_levels = by_levels + jnp.tensordot(seen**2, relative * by_relative, 2)
-    own = solved(process.to_white(observed, factors))
-    by_left = by_z - by_discrepancy - relative * process.from_white(by_numbers @ sums + own, factors)
-    found = left, white, jnp.log(jnp.diagonal(factors.root))
-    return found, (by_left, by_numbers @ (sums - moved) + own, by_levels)
+def _each_channel(matrices: Array, columns: Array) -> Array:
+    """Matrices (C, R, R) times columns (C, R)."""
+    return jnp.einsum("crs,cs->cr", matrices, columns)
+
+
+def _root(matrix: Array) -> Array:
+    """Cholesky factor of a symmetric matrix: XLA would compute its elements twice to symmetrise it."""
+    return cholesky(matrix, symmetrize_input=False)
 
 
 def _triangular_inverse(root: Array) -> Array:
     return solve_triangular(root, jnp.eye(len(root), dtype=root.dtype), lower=True)
 
 
-def _with_jitter(matrix: Array) -> Array:
+def _with_jitter(matrix: Array, least: float = JITTER) -> Array:
     """A matrix of correlations with what rounding leaves of its smallest eigenvalues on its diagonal."""
     rounding = 4.0 * len(matrix) * float(jnp.finfo(matrix.dtype).eps)  # above `JITTER` in single precision alone
-    return matrix + max(JITTER, rounding) * jnp.eye(len(matrix), dtype=matrix.dtype)
+    return matrix + max(least, rounding) * jnp.eye(len(matrix), dtype=matrix.dtype)
 
 
 def make_process(wi: ArrayLike, wo: ArrayLike, channels: int = 1) -> Process:
@@ -457,4 +470,4 @@ def make_process(wi: ArrayLike, wo: ArrayLike, channels: int = 1) -> Process:
     typical = TYPICAL * shortest
     own = correlation(among, among, *typical) + ROUNDING * np.eye(len(among))
     weights = np.linalg.solve(own, correlation(among, where, *typical)).T
-    return Process(*map(jnp.asarray, (among, weights, shortest)))
+    return Process(jnp.asarray(among), jnp.asarray(weights), jnp.asarray(shortest))

@@ -174,35 +174,35 @@ class Model(eqx.Module):
         """`standardised_at`, less the model discrepancy that the data imply."""
         if self.process is None:
             return self.standardised_at(vector, predicted)
-        return -self.whitened_at(vector, predicted).residuals
+        return -self.leave_one_out_at(vector, predicted)[0]
 
     def whitened_residuals_at(self, vector: Array, predicted: Array) -> Array:
         """`standardised_at` by the root of their covariance: under the assumed model independent, with variance 1."""
-        found = self.standardised_at(vector, predicted)
         if self.process is None:
-            return found
-        relative = self._relative_at(self._noise_at(vector, predicted))
-        return self.process.whitened_residuals(found, relative, self._correlation(vector))
+            return self.standardised_at(vector, predicted)
+        return -self.process.whitened_residuals(*self._of_process(vector, predicted))
 
     def chi_square_at(self, vector: Array, predicted: Array) -> Array:
         """z'S^-1 z of `standardised_at` z, with S their covariance: 1 without model discrepancy."""
         if self.process is None:
             return jnp.sum(self.standardised_at(vector, predicted) ** 2)
         found = self.whitened_at(vector, predicted)
-        return jnp.sum(found.residuals**2) + jnp.sum(found.latent**2)
+        return jnp.sum(found.unfitted**2) + jnp.sum(found.estimates**2)
 
     def whitened_at(self, vector: Array, predicted: Array, step: Step = None) -> Whitened:
-        """Residuals less the model discrepancy that the data imply, by the scale of the noise."""
+        """Independent residuals of the measurements and of the errors at inducing points."""
         assert self.process is not None
-        sigma = self._noise_at(vector, predicted, step)
-        at = self._correlation(vector, step)
-        return self.process.whitened(self._scaled(sigma, predicted), self._relative_at(sigma), at)
+        return self.process.whitened(*self._of_process(vector, predicted, step))
+
+    def leave_one_out_at(self, vector: Array, predicted: Array) -> tuple[Array, Array]:
+        """Residuals less the model discrepancy that the data imply, and precisions given all others, (N, C)."""
+        assert self.process is not None
+        return self.process.leave_one_out(*self._of_process(vector, predicted))
 
     def discrepancy_at(self, vector: Array, predicted: Array, places: Array) -> tuple[Array, Array]:
         """The model discrepancy at other `places`, as far as the data tell: mean and sd of the logarithm, (M, C)."""
         assert self.process is not None
-        relative = self._relative_at(self._noise_at(vector, predicted))
-        return self.process.predict(self.whitened_at(vector, predicted), relative, places, self._correlation(vector))
+        return self.process.predict(places, *self._of_process(vector, predicted))
 
     @property
     def logarithmic(self) -> tuple[int, ...]:
@@ -230,8 +230,7 @@ class Model(eqx.Module):
         if self.process is None:
             z = (self.values - predicted) / sigma
             return log_density(z, sigma, self.tails, self.degrees_of_freedom)
-        relative, at = self._relative_at(sigma), self._correlation(vector)
-        own, precision = self.process.leave_one_out(self.whitened_at(vector, predicted), relative, at)
+        own, precision = self.leave_one_out_at(vector, predicted)
         width = sigma / jnp.sqrt(precision)
         return log_density(own / jnp.sqrt(precision), width, self.tails, self.degrees_of_freedom)
 
@@ -241,7 +240,7 @@ class Model(eqx.Module):
             return jnp.sum(self.log_likelihood_per_datum_at(vector, predicted))
         sigma = self._noise_at(vector, predicted)
         found = self.whitened_at(vector, predicted)
-        squares = jnp.sum(found.residuals**2) + jnp.sum(found.latent**2)
+        squares = jnp.sum(found.unfitted**2) + jnp.sum(found.estimates**2)
         levels = jnp.sum(found.levels) + jnp.sum(jnp.log(sigma))
         return -0.5 * squares - levels - 0.5 * self.values.size * math.log(2.0 * math.pi)
 
@@ -263,6 +262,11 @@ class Model(eqx.Module):
         change = logarithm(predicted, self.softness) - logarithm(self.values, self.softness)
         return self._relative_at(sigma) * change
 
+    def _of_process(self, vector: Array, predicted: Array, step: Step = None) -> tuple[Array, Array, Correlation]:
+        """Residuals of the logarithm and an error of 1 in it, in units of the noise, and the numbers of the process."""
+        sigma = self._noise_at(vector, predicted, step)
+        return self._scaled(sigma, predicted), self._relative_at(sigma), self._correlation(vector, step)
+
     def _correlation(self, vector: Array, step: Step = None) -> Correlation:
         at = self.build(vector).correlation
         assert at is not None
@@ -279,7 +283,7 @@ class Model(eqx.Module):
             data = tail_residual((predicted - self.values) / sigma, self.tails, self.degrees_of_freedom)
         else:
             found = self.whitened_at(vector, predicted, step)
-            data = jnp.concatenate([found.residuals.reshape(-1), found.latent])
+            data = jnp.concatenate([found.unfitted.reshape(-1), found.estimates])
             levels.append(level_residual(found.levels))
         return (data, self.box.prior_residuals(vector), *levels)
 
@@ -294,7 +298,7 @@ class Model(eqx.Module):
         else:
             step = None if step is None else (jnp.full_like(step[0], jnp.nan), step[1])
             found = self.whitened_at(jax.lax.stop_gradient(vector), predicted, step)
-            rows = jnp.concatenate([found.residuals.reshape(-1), found.latent])
+            rows = jnp.concatenate([found.unfitted.reshape(-1), found.estimates])
             relative = self._relative_at(jax.lax.stop_gradient(sigma))
             levels.append(self.process.information_rows(relative, self._correlation(vector, step)))
         return jnp.concatenate([jnp.sqrt(of_mean) * rows, *levels])

@@ -23,7 +23,7 @@ from fits._files import require_switch
 from fits.data.geometry import Floats
 from fits.data.measurements import LARGEST, Measurements
 from fits.names import Objective
-from fits.problem.discrepancy import Discrepancy, Process, size, softness
+from fits.problem.discrepancy import Discrepancy, Process, Projection, size, softness
 from fits.problem.parameters import Free, is_free, require_number_or_free
 from layerjax._checks import in_short, require_choice, require_number
 
@@ -166,13 +166,13 @@ class Levels(NamedTuple):
         floor = self.floor.start if isinstance(self.floor, Free) else self.floor
         return softness(values, np.sqrt(self.variance + np.square(floor)))
 
-    def gram(self, process: Process, values: Floats) -> Array | None:
-        """What measurements (N, C) tell of a process of the discrepancy; None where it depends on parameters."""
+    def projection(self, process: Process, values: Floats) -> Projection | None:
+        """That of measurements (N, C) on a process of the discrepancy; None where it depends on parameters."""
         if self.fitted:
             return None
         variance, relative, floor = map(jnp.asarray, self)
         sigma = total_sigma(jnp.asarray(values), variance, relative, floor)
-        return process.gram_of(size(values, self.softness(values)) / sigma)
+        return process.project(size(values, self.softness(values)) / sigma)
 
 
 def is_assumed(noise: Noise, used: Measurements) -> bool:

@@ -373,7 +373,7 @@ def _assemble(problem: Problem) -> Assembled:
     process = correlation = setting = None
     if isinstance(noise.discrepancy, Discrepancy):
         process = make_process(used.wi, used.wo, used.values.shape[1])
-        process = replace(process, gram=levels.gram(process, used.values))
+        process = replace(process, projection=levels.projection(process, used.values))
         correlation = numbers_of(noise.discrepancy, np.asarray(process.shortest), used.values.shape[1])
     if problem.instrument is not None:
         setting = setting_of(problem.instrument, polar_angles(problem.data))
