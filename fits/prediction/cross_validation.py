@@ -24,7 +24,7 @@ from fits.optimise.result import Fit
 from fits.prediction.importance import Evidence, ImportanceDraws, evidence_of, posterior_draws
 from fits.prediction.options import ComparisonOptions
 from fits.prediction.predict import posterior_predictive
-from fits.problem.discrepancy import size
+from fits.problem.discrepancy import project, size
 from fits.problem.noise import total_sigma
 from fits.problem.problem import Problem
 from fits.progress import Progress, given_progress, named
@@ -188,7 +188,7 @@ def without(problem: Problem, held_out: ArrayLike) -> Problem:
     if model.process is not None and model.process.projection is not None:
         parts = model.build(jnp.asarray(problem.start))
         sigma = total_sigma(model.values, model.variance, parts.relative, parts.floor)
-        projection = model.process.project(size(model.values, model.softness) / sigma)
+        projection = project(model.process.weights, size(model.values, model.softness) / sigma)
         model = replace(model, process=replace(model.process, projection=projection))
     return problem.with_model(model)
 

@@ -141,9 +141,9 @@ def logarithm(x: Any, s: Any) -> Array:
     return jnp.arcsinh(x / s)
 
 
-def size(x: Any, s: Any) -> Array:
+def size(x: Any, s: Any) -> Any:
     """1 / g'(x), in the unit of x: by so much does x change with an error of 1 in the logarithm."""
-    return jnp.hypot(x, s)
+    return x.__array_namespace__().hypot(x, s)
 
 
 # ---- places in half and difference angle, the kernel there, and which places are inducing points ----
@@ -221,6 +221,20 @@ class Projection(NamedTuple):
     root: Array
 
 
+def project(weights: Any, relative: Any) -> Projection:
+    """The projection of measurements with these weights (N, R) and errors, see `Process`; of numpy or JAX."""
+    xp = weights.__array_namespace__()
+
+    def covariance(column: Any) -> Any:
+        rows = column[:, None] * weights
+        scale = 1.0 / xp.linalg.norm(rows, axis=0)
+        inverse = xp.linalg.inv(_with_jitter((rows * scale).T @ (rows * scale), 0.0))
+        return scale[:, None] * (0.5 * (inverse + inverse.T)) * scale
+
+    found = xp.stack([covariance(column) for column in relative.T])
+    return Projection(found, xp.linalg.cholesky(found))
+
+
 class Whitened(NamedTuple):
     """Independent residuals, of N measurements in C channels and R inducing points, as `fits.problem.discrepancy` says.
 
@@ -263,7 +277,7 @@ class Process(eqx.Module):
         weights: (N, R), from inducing points to measurements.
         shortest: (2,), what errors reach at least, in degrees of half vector and difference, so that inducing points
             carry them.
-        projection: `project` of the measurements where their noise is known; else None.
+        projection: that of the measurements where their noise is known; else None.
     """
 
     where: Array
@@ -271,21 +285,9 @@ class Process(eqx.Module):
     shortest: Array
     projection: Projection | None = None
 
-    def project(self, relative: Array) -> Projection:
-        """The projection of measurements on the inducing points."""
-
-        def covariance(column: Array) -> Array:
-            rows = column[:, None] * self.weights
-            scale = 1.0 / jnp.linalg.norm(rows, axis=0)
-            inverse = _triangular_inverse(_root(_with_jitter((rows * scale).T @ (rows * scale), 0.0)))
-            return scale[:, None] * (inverse.T @ inverse) * scale
-
-        found = jnp.stack([covariance(column) for column in relative.T])
-        return Projection(found, _root(found))
-
     def regress(self, numbers: Array, z: Array, relative: Array) -> Regression:
         """What measurements with these residuals say of errors at inducing points, beside what the process does."""
-        projection = self.project(relative) if self.projection is None else self.projection
+        projection = project(self.weights, relative) if self.projection is None else self.projection
         estimate = _each_channel(projection.covariance, self.observed(z, relative))
         both = block_diag(*projection.covariance) + self._covariance(numbers, relative.shape[-1])
         return Regression(projection, estimate, _root(both))
@@ -442,10 +444,10 @@ def _triangular_inverse(root: Array) -> Array:
     return solve_triangular(root, jnp.eye(len(root), dtype=root.dtype), lower=True)
 
 
-def _with_jitter(matrix: Array, least: float = JITTER) -> Array:
+def _with_jitter(matrix: Any, least: float = JITTER) -> Any:
     """A matrix of correlations with what rounding leaves of its smallest eigenvalues on its diagonal."""
     rounding = 4.0 * len(matrix) * float(jnp.finfo(matrix.dtype).eps)  # above `JITTER` in single precision alone
-    return matrix + max(least, rounding) * jnp.eye(len(matrix), dtype=matrix.dtype)
+    return matrix + max(least, rounding) * np.eye(len(matrix), dtype=matrix.dtype)
 
 
 def make_process(wi: ArrayLike, wo: ArrayLike, channels: int = 1) -> Process:

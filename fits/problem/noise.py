@@ -23,7 +23,7 @@ from fits._files import require_switch
 from fits.data.geometry import Floats
 from fits.data.measurements import LARGEST, Measurements
 from fits.names import Objective
-from fits.problem.discrepancy import Discrepancy, Process, Projection, size, softness
+from fits.problem.discrepancy import Discrepancy, Process, Projection, project, size, softness
 from fits.problem.parameters import Free, is_free, require_number_or_free
 from layerjax._checks import in_short, require_choice, require_number
 
@@ -84,9 +84,9 @@ def require_floor(name: str, floor: Any) -> None:
         require_number_or_free(name, floor, *LEVELS)
 
 
-def total_sigma(predicted: Array, variance: Array, relative: Array, floor: Array) -> Array:
-    """Scale of the noise at each datum, in 1/sr; `variance` is the measurement's own."""
-    return jnp.sqrt(variance + (relative * predicted) ** 2 + floor**2)
+def total_sigma(predicted: Any, variance: Any, relative: Any, floor: Any) -> Any:
+    """Scale of the noise at each datum, in 1/sr; `variance` is the measurement's own; of numpy or JAX."""
+    return predicted.__array_namespace__().sqrt(variance + (relative * predicted) ** 2 + floor**2)
 
 
 def log_density(z: Array, sigma: Array, tails: Tails, degrees_of_freedom: Array) -> Array:
@@ -170,9 +170,8 @@ class Levels(NamedTuple):
         """That of measurements (N, C) on a process of the discrepancy; None where it depends on parameters."""
         if self.fitted:
             return None
-        variance, relative, floor = map(jnp.asarray, self)
-        sigma = total_sigma(jnp.asarray(values), variance, relative, floor)
-        return process.project(size(values, self.softness(values)) / sigma)
+        sigma = total_sigma(values, *map(np.asarray, self))
+        return project(np.asarray(process.weights, float), size(values, self.softness(values)) / sigma)
 
 
 def is_assumed(noise: Noise, used: Measurements) -> bool:

@@ -373,7 +373,8 @@ def _assemble(problem: Problem) -> Assembled:
     process = correlation = setting = None
     if isinstance(noise.discrepancy, Discrepancy):
         process = make_process(used.wi, used.wo, used.values.shape[1])
-        process = replace(process, projection=levels.projection(process, used.values))
+        projection = levels.projection(process, used.values)
+        process = replace(process, projection=jax.tree.map(jnp.asarray, projection))
         correlation = numbers_of(noise.discrepancy, np.asarray(process.shortest), used.values.shape[1])
     if problem.instrument is not None:
         setting = setting_of(problem.instrument, polar_angles(problem.data))
