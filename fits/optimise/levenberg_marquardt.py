@@ -100,7 +100,7 @@ class BoxLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
             growth=zero + FIRST_GROWTH,
             auxiliary=auxiliary,
             watched=watched,
-            terminate=jnp.array(False),
+            terminate=jnp.asarray(options.get("most_steps", 1)) < 1,
             failed=jnp.array(False),
         )
 

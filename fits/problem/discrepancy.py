@@ -9,9 +9,10 @@ process lives on inducing points, and costs a matrix of as many rows: the places
 few, else of some, on which the others are regressed. Noise is that of the datum, so that the covariance does not depend
 on the model, and most of its derivatives vanish.
 
-What N measurements say of the errors at the inducing points is what their least squares y say, whose covariance by the
-noise alone is G^-1. With residuals z and errors W u of measurements in standard deviations of the noise, G = W'W, K the
-covariance of u, and S = G^-1 + K that of y, the negative log-density is half a sum of squares again, up to a constant:
+What N measurements say of the errors at the inducing points is what their least squares y say, whose covariance by
+independent noise is G^-1. With residuals z and errors W u of measurements in standard deviations of the noise, G = W'W,
+K the covariance of u, and S = G^-1 + K that of y, the negative log-density is half a sum of squares again, up to a
+constant:
 
     z'(1 + W K W')^-1 z + log det (1 + W K W') = |z - W y|^2 + y'S^-1 y + log det S - log det G^-1.
 
@@ -239,12 +240,14 @@ class Whitened(NamedTuple):
     """Independent residuals, of N measurements in C channels and R inducing points, as `fits.problem.discrepancy` says.
 
     unfitted: z - W y, (N, C). estimates: (S^-1/2) y, (C R,). levels: logarithms of the diagonal of the root of S over
-    that of G^-1, (C R,), none below 0.
+    that of G^-1, (C R,), none below 0. information: rows whose Jacobian A has in A'A the Fisher information of the
+    measurements about what they are predicted to be, and about the numbers of the process, tr(S^-1 dS S^-1 dS) / 2.
     """
 
     unfitted: Array
     estimates: Array
     levels: Array
+    information: Array
 
 
 class Regression(NamedTuple):
@@ -270,7 +273,8 @@ class Regression(NamedTuple):
 class Process(eqx.Module):
     """A process on R inducing points among the places of N measurements.
 
-    Residuals z of measurements, and `relative`, an error of 1 in the logarithm, are (N, C) and in units of the noise.
+    `misfit`, (N, C), is the logarithm of what is predicted less that of measurements; `relative`, (N, C), an error of 1
+    in it in units of the noise. Residuals z are their product.
 
     Attributes:
         where: the inducing points, (R, 4), see `places`.
@@ -285,10 +289,10 @@ class Process(eqx.Module):
     shortest: Array
     projection: Projection | None = None
 
-    def regress(self, numbers: Array, z: Array, relative: Array) -> Regression:
-        """What measurements with these residuals say of errors at inducing points, beside what the process does."""
+    def regress(self, misfit: Array, relative: Array, numbers: Array) -> Regression:
+        """What measurements say of errors at inducing points, beside what the process does."""
         projection = project(self.weights, relative) if self.projection is None else self.projection
-        estimate = _each_channel(projection.covariance, self.observed(z, relative))
+        estimate = _each_channel(projection.covariance, self.observed(relative * misfit, relative))
         both = block_diag(*projection.covariance) + self._covariance(numbers, relative.shape[-1])
         return Regression(projection, estimate, _root(both))
 
@@ -300,24 +304,24 @@ class Process(eqx.Module):
         """Errors of measurements, W u, (N, C), from those at inducing points, (C, R)."""
         return relative * (self.weights @ at_points.T)
 
-    def whitened(self, z: Array, relative: Array, at: Correlation) -> Whitened:
+    def whitened(self, misfit: Array, relative: Array, at: Correlation) -> Whitened:
         """Residuals as independent numbers."""
-        return Whitened(*_whitened(self._numbers(at, z.shape[-1]), z, relative, process=self))
+        return Whitened(*_whitened(misfit, relative, self._numbers(at, relative.shape[-1]), process=self))
 
     def sample(self, white: Array, at: Correlation) -> Array:
         """Errors of the measurements, (N, C), from standard normal numbers (C, R)."""
         between, own = map(_root, self._covariances(self._numbers(at, len(white)), len(white)))
         return at.amplitude * self.weights @ (between @ white @ own.T).T
 
-    def whitened_residuals(self, z: Array, relative: Array, at: Correlation) -> Array:
-        """Residuals z (N, C) by the symmetric root of their covariance, K^-1/2 z with K = 1 + W S W'.
+    def whitened_residuals(self, misfit: Array, relative: Array, at: Correlation) -> Array:
+        """Residuals z by the symmetric root of their covariance, (N, C): K^-1/2 z with K = 1 + W K W'.
 
         Where the model holds they are independent standard normal, and their squares add up to z'K^-1 z. What is left
         of z beside what the process explains (`leave_one_out`) is neither: the process follows each datum, so that it
         is smaller than 1, and negatively correlated between neighbours. Leave-one-out residuals have variance 1, but
         are correlated, too.
         """
-        found = self.regress(self._numbers(at, relative.shape[-1]), z, relative)
+        found, z = self.regress(misfit, relative, self._numbers(at, relative.shape[-1])), relative * misfit
         own = block_diag(*found.projection.root)  # W times it has orthonormal columns
         half = solve_triangular(own, found.root, lower=True)
         spread, axes = jnp.linalg.eigh(half @ half.T)
@@ -325,41 +329,30 @@ class Process(eqx.Module):
         shrunk = own @ axes @ ((1.0 / jnp.sqrt(jnp.maximum(spread, 1.0)) - 1.0) * explained)
         return z + self.errors(shrunk.reshape(found.estimate.shape), relative)
 
-    def leave_one_out(self, z: Array, relative: Array, at: Correlation) -> tuple[Array, Array]:
-        """Of each measurement its weighted residual, z less the errors that the process implies, and its precision,
-        (N, C): given all others it has mean residual / precision and variance 1 / precision, in units of the noise.
+    def leave_one_out(self, misfit: Array, relative: Array, at: Correlation) -> tuple[Array, Array]:
+        """Weighted residuals, z less the errors that the process implies, and precisions, (N, C).
+
+        Given all others a measurement has mean residual / precision and variance 1 / precision, in units of the noise.
         """
-        found = self.regress(self._numbers(at, relative.shape[-1]), z, relative)
+        found = self.regress(misfit, relative, self._numbers(at, relative.shape[-1]))
         weighted = solve_triangular(found.root, found.white, lower=True, trans=1).reshape(found.estimate.shape)
-        residuals = z + self.errors(_each_channel(found.projection.covariance, weighted) - found.estimate, relative)
+        explained = found.estimate - _each_channel(found.projection.covariance, weighted)
         rows = self._estimate_rows(relative, found.projection)  # of the precision: 1 - W G^-1 W' + W G^-1 S^-1 G^-1 W'
         both = jnp.einsum("cx,crn->crxn", jnp.eye(len(rows)), rows).reshape(len(found.root), -1)
         inside = jnp.sum(solve_triangular(found.root, both, lower=True) ** 2, axis=0).reshape(relative.shape[::-1])
-        return residuals, 1.0 - relative * jnp.einsum("crn,nr->nc", rows, self.weights) + inside.T
+        precision = 1.0 - relative * jnp.einsum("crn,nr->nc", rows, self.weights) + inside.T
+        return relative * misfit - self.errors(explained, relative), precision
 
-    def predict(self, at_places: Array, z: Array, relative: Array, at: Correlation) -> tuple[Array, Array]:
-        """Errors of the model at other `places`, given these residuals: mean and sd, (M, C)."""
-        found = self.regress(self._numbers(at, relative.shape[-1]), z, relative)
-        between = self._covariances(self._numbers(at, relative.shape[-1]), relative.shape[-1])[0]
+    def predict(self, at_places: Array, misfit: Array, relative: Array, at: Correlation) -> tuple[Array, Array]:
+        """Errors of the model at other `places`, given those of measurements: mean and sd, (M, C)."""
+        numbers, channels = self._numbers(at, relative.shape[-1]), relative.shape[-1]
+        found, between = self.regress(misfit, relative, numbers), self._covariances(numbers, channels)[0]
         sizes, own = (at.amplitude * jnp.exp(at.grazing_exponent * log_scales(x)) for x in (self.where, at_places))
         across = sizes[:, None] * own * correlation(self.where, at_places, at.length_half, at.length_difference)
         rows = jnp.einsum("cx,rm->crmx", between, across).reshape(len(found.root), -1)
-        solved = solve_triangular(found.root, rows, lower=True).reshape(-1, len(own), len(between))
+        solved = solve_triangular(found.root, rows, lower=True).reshape(-1, len(own), channels)
         variance = own[:, None] ** 2 - jnp.sum(solved**2, axis=0)
         return -jnp.tensordot(found.white, solved, 1), jnp.sqrt(jnp.maximum(variance, 0.0))
-
-    def information_rows(self, relative: Array, at: Correlation) -> Array:
-        """Rows whose Jacobian A has in A'A the Fisher information of the measurements about the numbers of the process.
-
-        It is tr(S^-1 dS S^-1 dS) / 2.
-        """
-        numbers = self._numbers(at, relative.shape[-1])
-        held = jax.lax.stop_gradient(numbers)
-        changes = self._changes(held, _triangular_inverse(self.regress(held, relative, relative).root))
-        information = 0.5 * jnp.einsum("kij,lij->kl", changes, changes)
-        scale = 1.0 / jnp.sqrt(jnp.maximum(jnp.diagonal(information), LEAST_INFORMATION))
-        scaled = information * scale[:, None] * scale + LEAST_INFORMATION * jnp.eye(len(scale))
-        return jax.lax.stop_gradient(_root(scaled).T / scale) @ numbers
 
     def _numbers(self, at: Correlation, channels: int) -> Array:
         """Those of a process that matter, (4,) or (5,)."""
@@ -373,14 +366,8 @@ class Process(eqx.Module):
         return _with_jitter(together + (1.0 - together) * jnp.eye(channels)), sizes[:, None] * own * sizes
 
     def _covariance(self, numbers: Array, channels: int) -> Array:
-        """Of errors at inducing points, (C R, C R)."""
+        """Covariance of errors at inducing points, (C R, C R)."""
         return jnp.kron(*self._covariances(numbers, channels)) * numbers[0] ** 2
-
-    def _changes(self, numbers: Array, inverse: Array) -> Array:
-        """S^-1/2 dS S^-1/2' by each number, (K, C R, C R); inverse: of the root of S."""
-        channels = len(inverse) // len(self.where)
-        changes = jax.jacfwd(lambda numbers: self._covariance(numbers, channels))(numbers)
-        return inverse @ jnp.moveaxis(changes, -1, 0) @ inverse.T
 
     def _estimate_rows(self, relative: Array, projection: Projection) -> Array:
         """G^-1 W', (C, R, N): the estimate by each measurement."""
@@ -388,10 +375,11 @@ class Process(eqx.Module):
 
 
 @eqx.filter_custom_jvp
-def _whitened(numbers: Array, z: Array, relative: Array, *, process: Process) -> tuple[Array, Array, Array]:
+def _whitened(misfit: Array, relative: Array, numbers: Array, *, process: Process) -> tuple[Array, ...]:
     """What `Whitened` holds. Where the noise is known `relative` depends on no parameter."""
-    found = process.regress(numbers, z, relative)
-    return z - process.errors(found.estimate, relative), found.white, found.levels
+    found = process.regress(misfit, relative, numbers)
+    unfitted = relative * misfit - process.errors(found.estimate, relative)
+    return unfitted, found.white, found.levels, jnp.concatenate([unfitted.reshape(-1), found.white, numbers])
 
 
 @_whitened.def_jvp
@@ -401,33 +389,51 @@ def _(primals: tuple[Any, ...], tangents: tuple[Any, ...], *, process: Process) 
         d(S^-1/2 y) = S^-1/2 dy - L(X) S^-1/2 y,    d log diag S^1/2 = diag X / 2.
 
     So a Jacobian by many parameters makes matrices for the few numbers of the process alone. Noise that is fitted
-    changes `relative` by shares s: dW = s W, dy = G^-1 W'(s (z - 2 W y)), dG^-1 = -2 G^-1 W's W G^-1.
+    changes `relative` by shares s: dW = s W, dy = G^-1 W'(s (2 z - 2 W y)), dG^-1 = -2 G^-1 W's W G^-1.
     """
-    numbers, z, relative = primals
-    by_numbers, by_z, by_relative = (
+    misfit, relative, numbers = primals
+    by_misfit, by_relative, by_numbers = (
         jnp.zeros_like(one) if tangent is None else tangent for one, tangent in zip(primals, tangents, strict=True)
     )
-    found = process.regress(numbers, z, relative)
-    inverse, fitted = _triangular_inverse(found.root), process.errors(found.estimate, relative)
-    white, unfitted, own = inverse @ found.estimate.reshape(-1), z - fitted, found.projection
-    changes = process._changes(numbers, inverse)
-    halves = 0.5 * jnp.diagonal(changes, axis1=1, axis2=2)
-    moved = (jnp.tril(changes) @ white) - halves * white
+    found = process.regress(misfit, relative, numbers)
+    inverse, own, fitted = _triangular_inverse(found.root), found.projection, process.errors(found.estimate, relative)
+    unfitted, white = relative * misfit - fitted, inverse @ found.estimate.reshape(-1)
 
-    shares = by_relative / relative if process.projection is None else jnp.zeros_like(z)
-    by_estimate = _each_channel(own.covariance, process.observed(by_z + shares * (unfitted - fitted), relative))
-    by_unfitted = by_z - shares * fitted - process.errors(by_estimate, relative)
-    by_white, by_levels = inverse @ by_estimate.reshape(-1) - by_numbers @ moved, by_numbers @ halves
+    # by what is predicted
+    estimate = _each_channel(own.covariance, process.observed(relative * by_misfit, relative))
+    by_unfitted, by_white = relative * by_misfit - process.errors(estimate, relative), inverse @ estimate.reshape(-1)
+    information = [by_unfitted.reshape(-1), by_white]
+
+    # by the numbers of the process
+    changes = jax.jacfwd(lambda numbers: process._covariance(numbers, relative.shape[-1]))(numbers)
+    changes = inverse @ jnp.moveaxis(changes, -1, 0) @ inverse.T
+    halves = 0.5 * jnp.diagonal(changes, axis1=1, axis2=2)
+    by_white = by_white - by_numbers @ (jnp.tril(changes) @ white - halves * white)
+    by_levels = by_numbers @ halves
+    information.append(_information_root(0.5 * jnp.einsum("kij,lij->kl", changes, changes)) @ by_numbers)
+
+    # by the noise
     if process.projection is None:
+        shares = by_relative / relative
+        estimate = _each_channel(own.covariance, process.observed(2.0 * shares * unfitted, relative))
+        by_unfitted = by_unfitted + shares * unfitted - process.errors(estimate, relative)
         rows = process._estimate_rows(relative, own)
         alone = solve_triangular(own.root, rows, lower=True)
         rows = jnp.einsum("mcr,crn->mcn", inverse.reshape(len(inverse), *found.estimate.shape), rows)
         weighted = rows * white[:, None, None]
         below = jnp.cumsum(weighted, axis=0) - 0.5 * weighted
-        by_white = by_white + 2.0 * jnp.einsum("mcn,mcn,nc->m", rows, below, shares)
+        by_white = by_white + inverse @ estimate.reshape(-1) + 2.0 * jnp.einsum("mcn,mcn,nc->m", rows, below, shares)
         by_levels = by_levels - jnp.einsum("mcn,nc->m", rows**2, shares)
         by_levels = by_levels + jnp.einsum("crn,nc->cr", alone**2, shares).reshape(-1)
-    return (unfitted, white, found.levels), (by_unfitted, by_white, by_levels)
+    value = unfitted, white, found.levels, jnp.concatenate([unfitted.reshape(-1), white, numbers])
+    return value, (by_unfitted, by_white, by_levels, jnp.concatenate(information))
+
+
+def _information_root(information: Array) -> Array:
+    """A root of the information about the numbers of a process, (K, K), of which some may have no effect."""
+    scale = 1.0 / jnp.sqrt(jnp.maximum(jnp.diagonal(information), LEAST_INFORMATION))
+    scaled = information * scale[:, None] * scale + LEAST_INFORMATION * jnp.eye(len(scale))
+    return jnp.linalg.cholesky(scaled).T / scale
 
 
 def _each_channel(matrices: Array, columns: Array) -> Array:

@@ -167,8 +167,10 @@ class Model(eqx.Module):
         """
         if self.objective != "likelihood":
             return -self._named(predicted)
-        sigma = self._noise_at(vector, predicted)
-        return (self.values - predicted) / sigma if self.process is None else -self._scaled(sigma, predicted)
+        if self.process is None:
+            return (self.values - predicted) / self._noise_at(vector, predicted)
+        misfit, relative, _ = self._of_process(vector, predicted)
+        return -relative * misfit
 
     def offsets_after_discrepancy_at(self, vector: Array, predicted: Array) -> Array:
         """`standardised_at`, less the model discrepancy that the data imply."""
@@ -222,7 +224,9 @@ class Model(eqx.Module):
         only and is never indefinite; for Gaussian noise that is known it is J'J. For a named objective: its residuals.
         """
         predicted = _by_columns(vector, model=self)
-        return self.residuals_at(vector, predicted, step), (predicted, self._information_rows(vector, predicted, step))
+        whitened = None if self.process is None else self.whitened_at(vector, predicted, step)
+        residuals = self.residuals_at(vector, predicted, step, whitened)
+        return residuals, (predicted, self._information_rows(vector, predicted, whitened))
 
     def log_likelihood_per_datum_at(self, vector: Array, predicted: Array) -> Array:
         """Normalised log-density of each datum, (N, C); with model discrepancy, given all others."""
@@ -253,28 +257,22 @@ class Model(eqx.Module):
         sigma = self.sigma_at(vector, predicted if self.process is None else self.values)
         return sigma if step is None or not self.varying else jnp.where(jnp.isfinite(step[0]), step[0], sigma)
 
-    def _relative_at(self, sigma: Array) -> Array:
-        """An error of 1 in a logarithm, in units of the noise, (N, C)."""
-        return size(self.values, self.softness) / sigma
-
-    def _scaled(self, sigma: Array, predicted: Array) -> Array:
-        """Logarithms of what is predicted less those of the data, in units of the noise, (N, C)."""
-        change = logarithm(predicted, self.softness) - logarithm(self.values, self.softness)
-        return self._relative_at(sigma) * change
-
     def _of_process(self, vector: Array, predicted: Array, step: Step = None) -> tuple[Array, Array, Correlation]:
-        """Residuals of the logarithm and an error of 1 in it, in units of the noise, and the numbers of the process."""
-        sigma = self._noise_at(vector, predicted, step)
-        return self._scaled(sigma, predicted), self._relative_at(sigma), self._correlation(vector, step)
+        """Misfit of the logarithm, an error of 1 in it in units of the noise, and the numbers of the process."""
+        misfit = logarithm(predicted, self.softness) - logarithm(self.values, self.softness)
+        relative = size(self.values, self.softness) / self._noise_at(vector, predicted, step)
+        return misfit, relative, self._correlation(vector, step)
 
     def _correlation(self, vector: Array, step: Step = None) -> Correlation:
         at = self.build(vector).correlation
         assert at is not None
         return at if step is None else at._replace(amplitude=step[1] * at.amplitude)
 
-    def residuals_at(self, vector: Array, predicted: Array, step: Step = None) -> tuple[Array, ...]:
+    def residuals_at(
+        self, vector: Array, predicted: Array, step: Step = None, whitened: Whitened | None = None
+    ) -> tuple[Array, ...]:
         """Arrays whose half sum of squares is minus the log-posterior up to a constant, or the named objective: of the
-        data, of the prior, and those of levels of noise (see `logarithmic`)."""
+        data, of the prior, and those of levels of noise (see `logarithmic`). whitened: at these, if known."""
         if self.objective != "likelihood":
             return (self._named(predicted),)
         sigma = self._noise_at(vector, predicted, step)
@@ -282,26 +280,20 @@ class Model(eqx.Module):
         if self.process is None:
             data = tail_residual((predicted - self.values) / sigma, self.tails, self.degrees_of_freedom)
         else:
-            found = self.whitened_at(vector, predicted, step)
-            data = jnp.concatenate([found.unfitted.reshape(-1), found.estimates])
-            levels.append(level_residual(found.levels))
+            if whitened is None:
+                whitened = self.whitened_at(vector, predicted, step)
+            data = jnp.concatenate([whitened.unfitted.reshape(-1), whitened.estimates])
+            levels.append(level_residual(whitened.levels))
         return (data, self.box.prior_residuals(vector), *levels)
 
-    def _information_rows(self, vector: Array, predicted: Array, step: Step) -> Array:
+    def _information_rows(self, vector: Array, predicted: Array, whitened: Whitened | None) -> Array:
         if self.objective != "likelihood":
             return self._named(predicted).reshape(-1)
         of_mean, of_level = information_weights(self.tails, self.degrees_of_freedom)
         sigma = self._noise_at(vector, predicted)
+        scaled = (predicted / jax.lax.stop_gradient(sigma)).reshape(-1) if whitened is None else whitened.information
         levels = [jnp.sqrt(of_level) * jnp.log(sigma).reshape(-1)] if self.varying else []
-        if self.process is None:
-            rows = (predicted / jax.lax.stop_gradient(sigma)).reshape(-1)
-        else:
-            step = None if step is None else (jnp.full_like(step[0], jnp.nan), step[1])
-            found = self.whitened_at(jax.lax.stop_gradient(vector), predicted, step)
-            rows = jnp.concatenate([found.unfitted.reshape(-1), found.estimates])
-            relative = self._relative_at(jax.lax.stop_gradient(sigma))
-            levels.append(self.process.information_rows(relative, self._correlation(vector, step)))
-        return jnp.concatenate([jnp.sqrt(of_mean) * rows, *levels])
+        return jnp.concatenate([jnp.sqrt(of_mean) * scaled, *levels])
 
 
 @eqx.filter_custom_jvp
