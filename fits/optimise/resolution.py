@@ -156,8 +156,9 @@ def error_between(
     values, sd = {transport: predicted}, spread(problem, vector, predicted)
 
     def measured(one: lj.AddingDoubling) -> Floats:
-        if one not in values:
-            values[one] = np.asarray(replace(problem, transport=one).predict(vector), float)
+        if one not in values:  # fits with and without discrepancy share a program
+            independent = replace(problem, transport=one, noise=replace(problem.noise, discrepancy=False))
+            values[one] = np.asarray(independent.predict(vector[: len(independent.names)]), float)
         if problem.objective == "likelihood":
             return values[one]
         return np.asarray(problem.call(Model.standardised_at, vector, values[one]), float)
