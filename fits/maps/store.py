@@ -26,6 +26,7 @@ from fits._files import given_path, named, plain, require_there
 from fits._lazy import shown_by
 from fits.engines import one_line
 from fits.maps.inputs import Block
+from fits.maps.options import MapOptions
 from fits.store import another, differences
 
 Floats = NDArray[np.float64]
@@ -190,8 +191,6 @@ class FittedMap:
 
     def option(self, name: str) -> Any:
         """A number of the `MapOptions` that the map was fitted with."""
-        from fits.maps.options import MapOptions
-
         return self.attributes["options"].get(name, getattr(MapOptions, name))
 
     def __getitem__(self, path: str) -> "zarr.Array[Any]":

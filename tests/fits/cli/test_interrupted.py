@@ -87,9 +87,9 @@ def test_a_full_disk_is_one_line_and_changes_nothing(work, capsys, coat_fit, wor
     with largest_file(6_000):
         error = refusal(words, capsys)
     assert error.startswith(f"layerjax: error: {name}: ")
-    assert error.endswith(("file too large", "quota allows"))
+    assert error.endswith("file too large")
     after = contents(work)
-    assert after.pop(str(work / "one" / "chain.db"), b"") == b""
+    after.pop(str(work / "one" / "chain.db"), None)  # holds what could be written of the chain
     assert after == before
 
 
