@@ -19,7 +19,7 @@ import layerjax as lj
 from fits._files import given_path, locked
 from fits.data.geometry import direction
 from fits.engines import Failure, connected, end_repeated_script, run
-from fits.maps.inputs import Block, MapData, Measured, block_words, map_data
+from fits.maps.inputs import Block, MapData, block_words, map_data
 from fits.maps.options import DEFAULT, VERDICTS, MapOptions
 from fits.maps.pilot import Job, fit_pilot, job_of, make_prototype, pilot_texels
 from fits.maps.search import reduced_chi_square, search
@@ -124,15 +124,14 @@ def _fit(
         store = create(path, about, arrays)
 
     # 3. all chunks
-    is_sent = not data.in_file and client is not None
-    job = job_of(store, problem, data.geometry is None, options, None if is_sent else data)
-    if failures := _fit_chunks(store, job, data, client, options):
+    job = job_of(store, problem, data.geometry is None, options, data)
+    if failures := _fit_chunks(store, job, client, options):
         named = [*failures[:NAMED], *([f"and {len(failures) - NAMED} more"] if len(failures) > NAMED else [])]
         raise ValueError(f"{path}: {'; '.join(named)}; all other chunks are done, and another run does these")
 
     # 4. neighbours held together
     if options.spatial_prior is not None:
-        smooth_map(store, job, data, client, options)
+        smooth_map(store, job, client, options)
     return open_map(path)
 
 
@@ -169,20 +168,15 @@ def tile(shape: tuple[int, ...], texels: int) -> tuple[int, ...]:
 # ---- chunks, wherever they are done ----
 
 
-def _fit_chunks(store: Store, job: Job, data: MapData, client: Any, options: MapOptions) -> list[str]:
+def _fit_chunks(store: Store, job: Job, client: Any, options: MapOptions) -> list[str]:
     """Fit the chunks that are left; the failures of those that could not be done."""
-    blocks, failures, tasks = store.unfinished(), [], []
-    for block in blocks:
-        try:
-            tasks.append((block, data.read(block) if job.data is None else None))
-        except ValueError as error:
-            failures.append(str(error))
+    blocks, failures = store.unfinished(), []
     total = sum(1 for _ in blocks_of(store.shape, store.chunk))
     done, poor, fitted = total - len(blocks), 0, 0
     options.report("map", done, total)
-    for index, result in run(work, job, tasks, client=client):
+    for index, result in run(work, job, blocks, client=client):
         if isinstance(result, Failure):
-            failures.append(f"chunk {block_words(tasks[index][0])}: {result.error}")
+            failures.append(f"chunk {block_words(blocks[index])}: {result.error}")
         else:
             fitted, poor = fitted + result["fitted"], poor + result["poor"]
         done += 1
@@ -192,18 +186,18 @@ def _fit_chunks(store: Store, job: Job, data: MapData, client: Any, options: Map
     return failures
 
 
-def work(job: Job, task: tuple[Block, Measured | None]) -> dict[str, int]:
+def work(job: Job, block: Block) -> dict[str, int]:
     """Fit a chunk and write it; returns how many texels have which flag."""
-    block, measured = task
-    results = fit_chunk(job, job.measured(block, measured))
+    results = fit_chunk(job, block)
     job.store.write(block, results)
     return {meaning: int(np.sum(results["flags"] & bit > 0)) for meaning, bit in FLAGS.items()}
 
 
-def fit_chunk(job: Job, measured: Measured) -> dict[str, NDArray[Any]]:
+def fit_chunk(job: Job, block: Block) -> dict[str, NDArray[Any]]:
     """The arrays of a store for one chunk, by their names, each of the chunk's shape."""
-    problem, size, shape = job.problem, job.options.chunk_size, measured.mask.shape
-    names, mask, texels = problem.names, measured.mask.reshape(-1), job.texels(measured)
+    mask, texels = job.texels(block)
+    problem, size, shape, mask = job.problem, job.options.chunk_size, mask.shape, mask.reshape(-1)
+    names = problem.names
     results = {name: np.full(texels.number, fill, dtype) for name, (dtype, fill) in arrays_of(names).items()}
     results["measurements"][:] = texels.measurements
     enough = texels.measurements >= len(names)

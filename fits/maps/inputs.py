@@ -208,11 +208,6 @@ class MapData:
         arguments = (values, geometry, sigma, mask)
         return map_data, tuple(os.path.abspath(one) if isinstance(one, str | os.PathLike) else one for one in arguments)
 
-    @property
-    def in_file(self) -> bool:
-        """Whether another process can read the values by itself."""
-        return isinstance(self.arguments[0], str | os.PathLike)
-
     def read(self, block: Block = ()) -> Measured:
         """The measurements of a block; what stands in masked texels is not looked at.
 

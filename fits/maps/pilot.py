@@ -50,7 +50,7 @@ class Job:
         emulator: in the place of its transport; None: that itself.
         starts: of all fits but those of the pilot.
         options: of the map; its chunk size is that of the program.
-        data: the measurements; None where each task brings its own.
+        data: the measurements.
     """
 
     path: str
@@ -58,7 +58,7 @@ class Job:
     emulator: Emulator | None
     starts: Starts
     options: MapOptions
-    data: MapData | None
+    data: MapData
 
     def __getstate__(self) -> dict[str, Any]:  # a model and an open store do not outlive their process
         return {one.name: getattr(self, one.name) for one in fields(self)}
@@ -73,16 +73,10 @@ class Job:
         """The store, opened once in each process."""
         return Store(self.path)
 
-    def texels(self, measured: Measured) -> Texels:
-        """Those of a block, one after the other."""
-        return texels_of(measured, least_floor(self.prototype))
-
-    def measured(self, block: Block, measured: Measured | None) -> Measured:
-        """The measurements of a block; measured: as the task brings them."""
-        if measured is not None:
-            return measured
-        assert self.data is not None
-        return self.data.read(block)
+    def texels(self, block: Block) -> tuple[NDArray[np.bool_], Texels]:
+        """Which texels of a block take part, (block shape), and those of the block, one after the other."""
+        measured = self.data.read(block)
+        return measured.mask, texels_of(measured, least_floor(self.prototype))
 
 
 def map_problem(problem: Problem, own_directions: bool, emulator: Emulator | None) -> Problem:
@@ -249,7 +243,7 @@ def fit_pilot(
     return arrays, about | {"numerical": numerical | {"error": error}}
 
 
-def job_of(store: Store, problem: Problem, own_directions: bool, options: MapOptions, data: MapData | None) -> Job:
+def job_of(store: Store, problem: Problem, own_directions: bool, options: MapOptions, data: MapData) -> Job:
     """The work of a map by what a store keeps of its pilot, see `fit_pilot`; problem: as that was called with."""
     kept, group = store.attributes["pilot"], store.load_group(PILOT)
     assert group is not None

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from fits._files import plain
 from fits.engines import Failure, run
-from fits.maps.inputs import Block, MapData, Measured, block_words
+from fits.maps.inputs import Block, block_words
 from fits.maps.options import Kind, MapOptions
 from fits.maps.pilot import Job
 from fits.maps.store import FLAGS, SMOOTHED, Store, blocks_of
@@ -63,7 +63,7 @@ class Half(NamedTuple):
     """The texels of one colour in a chunk.
 
     places: of M texels in the block, counted along its axes. units: where they are, (M, P), in the unit box. centre,
-    inverse_sd: how strongly their neighbours hold them, see `Texels`. measured: None where workers read it themselves.
+    inverse_sd: how strongly their neighbours hold them, see `Texels`.
     """
 
     block: Block
@@ -71,20 +71,19 @@ class Half(NamedTuple):
     units: Floats
     centre: Floats
     inverse_sd: Floats
-    measured: Measured | None
 
 
 def work(job: Job, task: Half) -> tuple[Floats, Floats]:
     """Fit texels given their neighbours: vectors and errors, (M, P), NaN where there is no finite fit."""
     problem = job.problem
-    rows = job.texels(job.measured(task.block, task.measured)).rows(task.places)
+    rows = job.texels(task.block)[1].rows(task.places)
     rows = rows._replace(centre=task.centre, inverse_sd=task.inverse_sd)
     best = fit_texels(problem, task.units, rows, job.options.chunk_size, fresh=False)
     errors, finite = standard_errors(problem, best, rows)[0], best.finite[:, None]
     return np.where(finite, best.vector, np.nan), np.where(finite, errors, np.nan)
 
 
-def smooth_map(store: Store, job: Job, data: MapData, client: Any, options: MapOptions) -> None:
+def smooth_map(store: Store, job: Job, client: Any, options: MapOptions) -> None:
     """Smooth a map that is fitted whole, into a group of its store, from where an earlier call stopped.
 
     Raises:
@@ -127,8 +126,7 @@ def smooth_map(store: Store, job: Job, data: MapData, client: Any, options: MapO
             for block in blocks_of(fitted.shape, store.chunk):
                 if (mine := coloured[block]).any():
                     at, to, inverse_sd = (one[block][mine] for one in (units, centre, np.sqrt(precision)))
-                    measured = data.read(block) if job.data is None else None
-                    tasks.append(Half(block, np.flatnonzero(mine), at, to, inverse_sd, measured))
+                    tasks.append(Half(block, np.flatnonzero(mine), at, to, inverse_sd))
             for index, result in run(work, job, tasks, client=client):
                 block, places, *_ = tasks[index]
                 if isinstance(result, Failure):
