@@ -239,7 +239,7 @@ def info(arguments: Namespace) -> int:
     from fits.reports.tables import Table
 
     out, force = arguments.out or f"{Path(arguments.data).stem}.png", arguments.force
-    require_free_place(arguments.out, force)
+    require_free_place(arguments.out, force, ".png", "pictures")
     data = read_options(arguments).read(arguments.data)
     show(Table(data.source.path, ("", ""), source_rows(data)), data_table(data), *data_statements(data))
     if Path(out).exists() and not force:

@@ -12,6 +12,7 @@ import itertools
 import os
 import shutil
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -108,9 +109,9 @@ class FittedMap:
             self.root = zarr.open_group(self.path, mode=mode)
             for name, array in self.arrays.items():
                 if array.shape != self.shape:
-                    raise ValueError(f"{name} has shape {array.shape}, must be {self.shape}")
+                    raise ValueError(f"the shape {array.shape} of {name}, which must be {self.shape}")
         except Exception as error:  # whatever a description that is none leads to
-            raise ValueError(f"{path}: damaged, {type(error).__name__} {one_line(error)}") from None
+            raise ValueError(f"{path}: damaged, its description lacks or misstates {one_line(error)}") from None
 
     @cached_property
     def arrays(self) -> dict[str, Any]:
@@ -247,14 +248,11 @@ def open_map(path: str | Path) -> FittedMap:
 def _attributes(path: Path) -> dict[str, Any]:
     """What the root of a store says under our key; ValueError for what is no such store."""
     require_there(path, "no such file or directory")
-    try:
+    with suppress(Exception):  # whatever else stands there
         about: Any = zarr.open_group(path, mode="r").attrs[KEY]
         if about["kind"] == KIND:
             return about
-        reason = f"it holds a {about['kind']}"
-    except Exception as error:  # whatever else stands there
-        reason = f"{type(error).__name__} {one_line(error)}"
-    raise ValueError(f"{path}: is no store of a {KIND}, as `layerjax fit-map` writes it ({reason})")
+    raise ValueError(f"{path}: is no store of a {KIND}, as `layerjax fit-map` writes it")
 
 
 # ---- writing ----

@@ -142,10 +142,8 @@ def load_fit(directory: str | Path) -> "Fit":
         )
         alternatives = tuple(minima[index] for index in content["alternatives"])
         return Fit(problem=problem, minima=minima, alternatives=alternatives, **stored)
-    except (LookupError, TypeError, AttributeError, ArithmeticError, ValueError) as error:
-        if isinstance(error, ValueError) and str(error).startswith(str(directory)):
-            raise
-        raise ValueError(f"{directory / FIT}: damaged, {type(error).__name__} {error}") from None
+    except (LookupError, TypeError, AttributeError) as error:
+        raise ValueError(f"{directory / FIT}: damaged, it is not what `save_fit` writes") from error
 
 
 def _problem(directory: Path, content: dict[str, Any]) -> "Problem":

@@ -16,7 +16,7 @@ FIT = "fit data.csv --stack coat.toml --out result"
 
 REFUSALS = (
     ("info nowhere.csv", "nowhere.csv"),
-    ("info data.csv --out coat.toml", "--force"),
+    ("info data.csv --out data.csv", "pictures can be written as .png only"),
     ("info data.csv --read format=mrel", "format is 'mrel', must be one of csv, "),
     ("info data.csv --read csv", "'csv' is no option of a reader; it must be format=..., quantity=..., bins=..."),
     ("info data.csv --read format=csv format=csv", "format is given twice"),
@@ -48,7 +48,7 @@ REFUSALS = (
     ("render fabrik --out a.png", "neither a .toml file nor a material of the gallery: window_shade"),
     ("render fabric --out a.jpg", "pictures can be written as .png only"),
     ("fit-many scans", "no stack is given"),
-    ("fit-many scans --stacks coat.toml --read strata=flux", "lookup and strata apply to MERL files only"),
+    ("info data.csv --read strata=flux", "lookup and strata apply to MERL files only"),
 )
 
 
