@@ -246,25 +246,20 @@ def corner_picture(posterior: "Posterior") -> Figure:
     """Every pair of parameters and every single parameter, over the posterior's samples; lines at the fitted values."""
     import corner
 
-    count = len(posterior.names)
-    side = float(np.clip(1.6 * count, 4.0, 11.0))
-    best = [posterior.fit.values[name] for name in posterior.names]
+    side = float(np.clip(1.6 * len(posterior.names), 4.0, 11.0))
     with mpl.rc_context(STYLE | {"axes.grid": False, "axes.titlesize": 8}):
         figure = Figure(figsize=(side, side))
         corner.corner(
             np.asarray(posterior.samples),
             labels=list(posterior.names),
-            titles=[f"{name}\n" for name in posterior.names],
             quantiles=(0.16, 0.5, 0.84),
             show_titles=True,
             title_fmt=".3g",
-            truths=best,
+            truths=[posterior.fit.values[name] for name in posterior.names],
             truth_color=CYCLE[1],
             color=CYCLE[0],
-            hist_kwargs={"color": CYCLE[0]},
             label_kwargs={"fontsize": 8},
             max_n_ticks=3,
-            labelpad=0.1,
             fig=figure,
             quiet=bool(posterior.modes),  # of modes narrower than a bin there are no contours
         )
