@@ -119,12 +119,8 @@ class FittedFiles:
 
     @property
     def best(self) -> dict[str, str]:
-        """The stack of the lowest loss of each file, or the only one that was fitted."""
-        fitted = [row for row in self.rows if row["result"] != "failed"]
-        files = [row["file"] for row in fitted]
-        return {
-            row["file"]: row["stack"] for row in fitted if row["standing"] == "best" or files.count(row["file"]) == 1
-        }
+        """The stack of the lowest loss of each file, where losses can be compared."""
+        return {row["file"]: row["stack"] for row in self.rows if row["standing"] == "best"}
 
 
 def fit_files(
@@ -354,7 +350,7 @@ def ranked(rows: Sequence[Row]) -> tuple[Row, ...]:
     standing: dict[int, str] = {}
     for file in {row["file"] for row in rows}:
         own = [row for row in rows if row["file"] == file and math.isfinite(row.get("loss", math.nan))]
-        if len(own) > 1 and len({row["criterion"] for row in own}) == 1:
+        if len({row["criterion"] for row in own}) == 1:
             best = min(own, key=lambda row: (row["result"] != "converged", row["loss"]))
             standing |= {id(row): f"{row['loss'] - best['loss']:+.1f}" for row in own} | {id(best): "best"}
     return tuple(row | {"standing": standing.get(id(row), "")} for row in rows)
@@ -380,8 +376,7 @@ def table_csv(rows: Sequence[Row]) -> str:
 def overview(rows: Sequence[Row], most: int) -> tables.Table:
     """A row each, without the parameters."""
     columns = ["file", "stack", "result", "standing", "reduced_chi_square", "criterion", "loss", "seconds", "status"]
-    # all of the status is in the table and in the report of the fit
-    shown = [tuple("; ".join(_cell(row.get(name, ""), 4).split("; ")[:2]) for name in columns) for row in rows]
+    shown = [tuple(_cell(row.get(name, ""), 4) for name in columns) for row in rows]
     note = "Standing: among the stacks of a file, by -2 log predictive density of held-out data, or else AIC."
     return tables.Table("Fits", tuple(columns), tables.shortened(shown, most), note)
 

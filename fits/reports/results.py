@@ -9,7 +9,6 @@ chain.db       the posterior's chain, once sampled, and summary.json with its es
 report.html    the report, pictures inside
 """
 
-import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, fields, is_dataclass, replace
@@ -23,6 +22,7 @@ from fits._files import (
     given_path,
     locked,
     read_json,
+    replacing,
     require_switch,
     require_there,
     text_checksum,
@@ -282,26 +282,11 @@ def writing(directory: str | Path, force: bool = False) -> Iterator[Path]:
     require_switch("force", force)
     check_directory(directory, force)
     target = directory.resolve()
-    folder, old = target.with_name(f".{target.name}.layerjax-new"), target.with_name(f".{target.name}.layerjax-old")
-    with locked(target.with_name(f".{target.name}.lock"), str(directory)):
-        # as a killed process left them
-        if old.exists() and not target.exists():
-            old.rename(target)
-        for left in (folder, old):
-            shutil.rmtree(left, ignore_errors=True)
+    with locked(target.with_name(f".{target.name}.lock"), str(directory)), replacing(target) as folder:
         try:
-            folder.mkdir()
             yield folder
-            check_directory(directory, force)  # someone else may have written there in the meantime
-            if target.exists():
-                with locked(target / LOCK, str(directory)):
-                    target.rename(old)
-            folder.rename(target)
-            shutil.rmtree(old, ignore_errors=True)
-        except BaseException as error:
-            shutil.rmtree(folder, ignore_errors=True)
-            if old.exists() and not target.exists():
-                old.rename(target)
-            if isinstance(error, OSError) and str(error.filename).startswith(f"{folder}"):
-                error.filename = f"{directory}{str(error.filename).removeprefix(str(folder))}"  # which the user knows
+        except OSError as error:
+            if str(error.filename).startswith(f"{folder}"):  # of which the user knows nothing
+                error.filename = f"{directory}{str(error.filename).removeprefix(str(folder))}"
             raise
+        check_directory(directory, force)  # someone else may have written there in the meantime

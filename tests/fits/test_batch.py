@@ -261,18 +261,17 @@ FAILED = {"file": "a.csv", "stack": "two", "result": "failed", "status": "unread
         # what did not converge is not the best of what did
         ([row("one", 10.0, result="not converged"), row("two", 17.0)], ["-7.0", "best"]),
         # nothing is said of what cannot be compared
-        ([row("one", 10.0)], [""]),
-        ([row("one", 10.0), FAILED], ["", ""]),
+        ([row("one", 10.0), FAILED], ["best", ""]),
         ([row("one", 10.0), row("two", 90.0, criterion="cube_root")], ["", ""]),
     ],
 )
 def test_stacks_of_a_file_are_ranked(rows, words):
     others = [row("one", 9.0, "b.csv"), row("two", 1.0, "b.csv"), row("one", 1.0, "c")]
     ranked = batch.ranked([*rows, *others])
-    assert [one["standing"] for one in ranked] == [*words, "+8.0", "best", ""]
+    assert [one["standing"] for one in ranked] == [*words, "+8.0", "best", "best"]
     best = fits.FittedFiles(Path(), ranked).best
     assert (best["b.csv"], best["c"]) == ("two", "one")
-    assert ("a.csv" in best) == ("best" in words or len(rows) - sum(one["result"] == "failed" for one in rows) == 1)
+    assert ("a.csv" in best) == ("best" in words)
     found = fits.FittedFiles(Path(), ranked, ("scans/README.md",))
     count, there = len(ranked), sum(one["result"] != "failed" for one in ranked)
     assert batch.statements(found)[0].startswith(f"{there} of {count} fits are there, ")

@@ -13,7 +13,8 @@ import zarr
 
 import fits
 import layerjax as lj
-from fits.maps.store import FLAGS, PARTIAL, SMOOTHED, Store, arrays_of, blocks_of, open_map
+from fits._files import PARTIAL
+from fits.maps.store import FLAGS, SMOOTHED, Store, arrays_of, blocks_of, open_map
 from tests.helpers.files import contents
 from tests.helpers.painted_maps import ATTRIBUTES, NAMES, UNITS, numbers, stored
 from tests.helpers.quick_maps import assert_same, coat, fitted, full_disk
