@@ -88,7 +88,7 @@ def replacing(target: Path) -> Iterator[Path]:
     One process at a time may do so: the caller holds a lock.
     """
     restore(target)
-    new, old = _beside(target)
+    new, old = _scratch(target)
     try:
         new.mkdir()
         yield new
@@ -101,14 +101,14 @@ def replacing(target: Path) -> Iterator[Path]:
 
 def restore(target: Path) -> None:
     """Tidy up what a process that was killed left beside a directory: half of a new one goes, an old one comes back."""
-    new, old = _beside(target)
+    new, old = _scratch(target)
     if old.exists() and not target.exists():
         old.rename(target)
     for left in (new, old):
         shutil.rmtree(left, ignore_errors=True)
 
 
-def _beside(target: Path) -> tuple[Path, Path]:
+def _scratch(target: Path) -> tuple[Path, Path]:
     return target.with_name(f".{target.name}.new{PARTIAL}"), target.with_name(f".{target.name}.old{PARTIAL}")
 
 

@@ -166,13 +166,13 @@ def fit_files(
     require_count("processes", processes, 1)
     require_switch("reports", reports)
     require_switch("force", force)
-    reading, out, progress = read_options or ReadOptions(), given_path("out", out), given_progress(progress)
-    paths, skipped = _measurement_files(_several("files", files), reading.format)
+    read_options, out, progress = read_options or ReadOptions(), given_path("out", out), given_progress(progress)
+    paths, skipped = _measurement_files(_several("files", files), read_options.format)
     given = {path.stem: read_problem(path) for path in _named_apart(_several("stacks", stacks), lambda one: one.stem)}
     if not given:
         raise ValueError("no stack is given; there must be at least one")
     for problem in given.values():
-        require_score(problem, bool(reading.hold_out))
+        require_score(problem, bool(read_options.hold_out))
     if not out.resolve().parent.is_dir():
         raise ValueError(f"{out}: there is no directory {out.parent}")
     if out.exists() and not out.is_dir():
@@ -181,12 +181,12 @@ def fit_files(
         raise ValueError(
             f"{out}: is not empty, and holds no fits of files (no {STORE} of theirs): choose another directory"
         )
-    how_read = {f"read {name}": value for name, value in vars(reading).items()}
-    if reading.geometry is not None:
-        how_read["read geometry"] = [reading.geometry.wi, reading.geometry.wo]
+    how_read = {f"read {name}": value for name, value in vars(read_options).items()}
+    if read_options.geometry is not None:
+        how_read["read geometry"] = [read_options.geometry.wi, read_options.geometry.wo]
     with named(out):
         out.mkdir(exist_ok=True)
-    job = Job(out.absolute(), given, reading, {"starts": starts, "seed": seed, "report": reports})
+    job = Job(out.absolute(), given, read_options, {"starts": starts, "seed": seed, "report": reports})
 
     with Store.open(out / STORE, fingerprint(of="fit-many")) as store:
         # what is done, and what is left
@@ -286,7 +286,7 @@ class Job(NamedTuple):
 
     out: Path
     stacks: Mapping[str, ProblemFile]
-    reading: ReadOptions
+    read_options: ReadOptions
     fitting: Mapping[str, Any]
 
 
@@ -316,7 +316,7 @@ def fit_one(job: Job, task: Task) -> Row:
     make_room()
     began, directory = time.monotonic(), job.out / task.key
     try:
-        data, held_out = job.reading.split(task.path)
+        data, held_out = job.read_options.split(task.path)
         with named(directory.parent):
             directory.parent.mkdir(exist_ok=True)
         whole = fit_file(directory, job.stacks[task.stack], data, held_out, force=True, **job.fitting)

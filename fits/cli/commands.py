@@ -3,7 +3,6 @@
 Inputs are checked, and outputs refused, before any work begins. Numbers go to stdout, progress to stderr.
 """
 
-import os
 import warnings
 from argparse import Namespace
 from collections.abc import Callable
@@ -126,25 +125,19 @@ def report(arguments: Namespace) -> int:
     from fits.reports import results
     from fits.reports.html import FitReport
 
-    directory, out = Path(arguments.directory), arguments.out
-    require_free_place(out, arguments.force)
+    directory = Path(arguments.directory)
+    require_free_place(arguments.out, arguments.force)
     result, posterior = results.load_fit(directory), results.load_posterior(directory)
-    if out is None and not os.access(directory, os.W_OK):
-        raise ValueError(f"{directory}: cannot be written to (--out FILE writes the report elsewhere)")
-    others = _candidates(arguments.compare, arguments.directory)
-    whole = FitReport(result, posterior, others, arguments.directory, results.load_held_out(directory))
-    if out is None:
-        whole.write(directory)
-    else:
-        write_text(out, whole.page(), force=arguments.force)
-    print(f"Report: {out or directory / results.REPORT}")
+    others, held_out = _candidates(arguments.compare), results.load_held_out(directory)
+    out = arguments.out or directory / results.REPORT
+    page = FitReport(result, posterior, others, arguments.directory, held_out).page()
+    write_text(out, page, force=arguments.force or arguments.out is None)
+    print(f"Report: {out}")
     return DONE
 
 
 def compare(arguments: Namespace) -> int:
     """Print which of several saved fits predicts the data best."""
-    if len(arguments.directories) < 2:
-        raise ValueError(f"{arguments.directories[0]} is the only directory given, must be two or more")
     use_jax()
     from fits.prediction.compare import compare as run_compare
     from fits.reports import tables
@@ -152,16 +145,12 @@ def compare(arguments: Namespace) -> int:
     candidates = _candidates(arguments.directories)
     with show_progress() as progress:
         compared = run_compare(candidates, refit=not arguments.no_refit, progress=progress)
-    show(tables.comparison_table(compared), *compared.verdict)
+    show(tables.comparison_table(compared), compared.verdict)
     return DONE
 
 
-def _candidates(directories: list[str], *others: str) -> "dict[str, Fit | Posterior]":
-    """The fits of these directories, or their posteriors, under these words; others: which are not among them."""
-    places = [Path(directory).resolve() for directory in (*directories, *others)]
-    for directory, place in zip(directories, places, strict=False):
-        if places.count(place) > 1:
-            raise ValueError(f"{directory} is given twice")
+def _candidates(directories: list[str]) -> "dict[str, Fit | Posterior]":
+    """The fits of these directories, or their posteriors, under these words."""
     return {directory: _result(Path(directory)) for directory in directories}
 
 

@@ -128,7 +128,7 @@ class FitReport:
             picture = _picture(
                 model.curves_picture({self.name: fit, **fits_of(self.others)}), "The fits beside the data."
             )
-            body.append(section("Comparison", found.verdict, tables.comparison_table(found), picture))
+            body.append(section("Comparison", found.verdict.splitlines(), tables.comparison_table(found), picture))
         return document(title, [*body, made_with()])
 
 
@@ -167,7 +167,7 @@ def posterior_fragment(posterior: "Posterior") -> str:
 
 def comparison_fragment(comparison: "Comparison") -> str:
     """Which of several fits predicts the data best, and by how much."""
-    return _paragraph(list(comparison.verdict)) + html_table(tables.comparison_table(comparison))
+    return _paragraph([comparison.verdict]) + html_table(tables.comparison_table(comparison))
 
 
 def _paragraph(words: list[str]) -> str:
