@@ -94,7 +94,8 @@ def connected(client: Any, processes: int = 1) -> Iterator[Any]:
     if client is None and processes == 1:
         yield None
         return
-    end_repeated_script()
+    if getattr(current_process(), "_inheriting", False):  # a worker that runs its parent's script, which has no guard
+        sys.exit(SCRIPT_REPEATED)
     try:
         from distributed import Client
     except ImportError:
@@ -147,13 +148,6 @@ def local_cluster(processes: int) -> Iterator[Any]:
             yield client
     finally:
         logger.setLevel(level)
-
-
-def end_repeated_script() -> None:
-    """End a worker process that runs its parent's script, which has no guard, to where that starts workers: to be
-    called before anything that must not be repeated."""
-    if getattr(current_process(), "_inheriting", False):
-        sys.exit(SCRIPT_REPEATED)
 
 
 # ---- threads of this process ----

@@ -267,14 +267,14 @@ def simulate(arguments: Namespace) -> int:
     """Write simulated measurements of a stack; noise, scale and instrument of its file are not simulated."""
     require_free_place(arguments.out, arguments.force, ".csv", "measurements")
     use_jax()
+    from fits.problem.parameters import at_start
     from fits.problem.simulate import simulate as run_simulation
     from fits.problem.stack_file import read_problem
 
     given = read_problem(arguments.stack)
     geometry = slices([theta for several in arguments.incidence for theta in several], azimuth=arguments.azimuth)
-    data = run_simulation(
-        _at_start(given.stack), geometry, transport=given.transport, noise=arguments.noise, seed=arguments.seed
-    )
+    how = {"transport": given.transport, "noise": arguments.noise, "seed": arguments.seed}
+    data = run_simulation(at_start(given.stack), geometry, **how)
     return _write_measurements(data, arguments)
 
 
@@ -327,6 +327,7 @@ def export(arguments: Namespace) -> int:
 
 def _material(name: str) -> "tuple[Fit | Stack | Mixture, Any]":
     """A saved fit, or a stack of the gallery or of a file, at its start; and its transport, None if not given."""
+    from fits.problem.parameters import at_start
     from fits.problem.stack_file import read_problem
     from fits.reports.results import load_fit
     from layerjax import gallery
@@ -337,17 +338,8 @@ def _material(name: str) -> "tuple[Fit | Stack | Mixture, Any]":
         return gallery.stack(name), None
     if Path(name).suffix == ".toml":
         given = read_problem(name)
-        return _at_start(given.stack), None if given.transport == "auto" else given.transport
+        return at_start(given.stack), None if given.transport == "auto" else given.transport
     raise ValueError(f"{name}: neither a .toml file nor a material of the gallery: {', '.join(gallery.names())}")
-
-
-def _at_start(stack: "Stack | Mixture") -> "Stack | Mixture":
-    """The stack with every free parameter at its start value."""
-    import jax
-
-    from fits.problem.parameters import is_free, with_values
-
-    return with_values(jax.tree.map(lambda leaf: leaf.arrays()[0] if is_free(leaf) else leaf, stack, is_leaf=is_free))
 
 
 COMMANDS: dict[str, Callable[[Namespace], int]] = {

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 import layerjax as lj
 from fits._files import given_path, locked
 from fits.data.geometry import direction
-from fits.engines import Failure, connected, end_repeated_script, run
+from fits.engines import Failure, connected, run
 from fits.maps.inputs import Block, MapData, block_words, map_data
 from fits.maps.options import DEFAULT, VERDICTS, MapOptions
 from fits.maps.pilot import Job, fit_pilot, job_of, make_prototype, pilot_texels
@@ -28,7 +28,7 @@ from fits.maps.store import FLAGS, FittedMap, Store, arrays_of, blocks_of, creat
 from fits.maps.texels import standard_errors
 from fits.problem.model import Transport
 from fits.problem.noise import Noise, is_assumed
-from fits.problem.parameters import is_free, with_values
+from fits.problem.parameters import at_start, is_free
 from fits.problem.problem import with_floor
 from fits.store import fingerprint, portable_repr
 from layerjax._checks import require_kind
@@ -76,8 +76,6 @@ def fit_map(
         OSError: of the store, such as a full disk: chunks that are in it stay.
     """
     require_kind("options", options, MapOptions)
-    if options.processes > 1 and client is None:
-        end_repeated_script()
     data = map_data(values, geometry, sigma, mask)
     require_kind("noise", noise, Noise, None)
     if options.instrument is not None and data.geometry is None:
@@ -88,7 +86,7 @@ def fit_map(
     path = given_path("out", out)
     if not path.resolve().parent.is_dir():
         raise ValueError(f"{path}: there is no directory {path.parent}")
-    with locked(Path(f"{path}.lock"), str(path)), connected(client, options.processes) as connection:
+    with connected(client, options.processes) as connection, locked(Path(f"{path}.lock"), str(path)):
         return _fit(path, data, stack, noise, transport, replace(options, chunk_size=size), connection)
 
 
@@ -148,8 +146,7 @@ def _identity(stack: Any, noise: Noise | None, transport: Any, samples: int, opt
     if not isinstance(transport, str | lj.Transport):
         angles = np.linspace(5.0, 75.0, samples)
         wi, wo = direction(angles, 0.0 * angles), direction(angles[::-1], 20.0 * angles)
-        start = jax.tree.map(lambda one: jnp.asarray(one.arrays()[0]) if is_free(one) else one, stack, is_leaf=is_free)
-        parts["transport"] += [np.asarray(jax.jit(transport)(with_values(start), wi, wo), np.float32)]
+        parts["transport"] += [np.asarray(jax.jit(transport)(at_start(stack), wi, wo), np.float32)]
     return fingerprint(**parts, **numbers, precision=precision)
 
 

@@ -28,19 +28,6 @@ from fits.reports.plots.data import GREY, LOG_ABOVE, STYLE, as_png
 from fits.reports.tables import with_error
 from fits.reports.verdicts import listed
 
-WORDS = {
-    "fitted": "fitted",
-    "converged": "converged",
-    "at_bound": "at a bound",
-    "poor": "poor: chi-square above what noise and the pilot explain",
-    "restarted": "fitted again from other starts",
-    "masked": "masked",
-    "too_few_measurements": "too few measurements",
-    "failed": "failed: no finite value",
-    "unidentified": "a parameter is unidentified",
-}
-"""The meaning of each flag."""
-
 INNER = (1.0, 99.0)  # percentiles between which colours run
 WIDTH = 4.8  # inches
 NO_VALUE = "#d4d4d4"
@@ -203,7 +190,7 @@ def count_table(summary: Summary) -> Table:
         if count or flag == "fitted":
             of_map = flag in ("fitted", "masked", "too_few_measurements", "failed")
             percent = share(count, summary.texels) if of_map else f"{share(count, summary.fitted)} of the fitted"
-            rows.append((WORDS[flag], count, percent))
+            rows.append((flag.replace("_", " "), count, percent))
     for name, count in summary.at_bound.items():
         if count:
             rows.append((f"at a bound: {name}", count, f"{share(count, summary.fitted)} of the fitted"))
