@@ -12,8 +12,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import h5py
 import numpy as np
 import xarray as xr
+import zarr
 from numpy.typing import NDArray
 
 from fits._files import require_there
@@ -117,7 +119,10 @@ def _arrays_of_file(source: str, wanted: str) -> Arrays:
             "layerjax fit-many"
         )
     try:
-        root = _opened(path, suffix)
+        if suffix == ".npy":
+            root = np.load(path, mmap_mode="r", allow_pickle=False)
+        else:
+            root = zarr.open(path, mode="r") if suffix == ".zarr" else h5py.File(path, "r")
         node = root[name] if name else root
         if is_array := hasattr(node, "dtype"):
             group, _, last = name.rpartition("/")
@@ -132,18 +137,6 @@ def _arrays_of_file(source: str, wanted: str) -> Arrays:
     if is_array:
         arrays[wanted] = arrays.get(last) or _array(node, source)
     return arrays
-
-
-def _opened(path: str, suffix: str) -> Any:
-    if suffix == ".npy":
-        return np.load(path, mmap_mode="r", allow_pickle=False)
-    if suffix == ".zarr":
-        import zarr
-
-        return zarr.open(path, mode="r")
-    import h5py
-
-    return h5py.File(path, "r")
 
 
 def _group(path: str, suffix: str, name: str, root: Any) -> Mapping[Any, Any]:

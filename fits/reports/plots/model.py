@@ -56,13 +56,6 @@ def misfit(fit: "Fit") -> np.ndarray:
     return over_all_rows(fit, independent / residual_unit(fit))
 
 
-def residual_label(fit: "Fit") -> str:
-    """The name of an axis of a `misfit`."""
-    if not fit.is_posterior:
-        return f"residual of {fit.problem.objective} / its scatter"
-    return rf"(data $-$ {'with discrepancy' if fit.problem.noise.discrepancy else 'model'}) / $\sigma$"
-
-
 def curves_picture(fits: "dict[str, Fit]", posterior: "Posterior | None" = None) -> Figure | None:
     """Data and models per incidence against the signed viewing angle, with residuals in units of sigma below each.
 
@@ -204,7 +197,7 @@ def maps_picture(fit: "Fit", channel: int = 0) -> Figure | None:
                 axes.set_title(f"{incidence.label}: {what}")
         bar: dict[str, Any] = {"shrink": 0.7, "aspect": 30}
         figure.colorbar(image, ax=panels[:, :2].ravel().tolist(), label=value_label(data, channel), **bar)
-        label = residual_label(fit)
+        label = rf"(data $-$ {model}) / $\sigma$" if fit.is_posterior else "residual / its scatter"
         figure.colorbar(signed, ax=panels[:, 2].tolist(), label=label, extend="both", **bar)
     return figure
 
