@@ -30,7 +30,7 @@ from fits.progress import Progress, given_progress, silent
 from fits.reports import results, tables
 from fits.reports.html import FitReport
 from fits.reports.verdicts import listed
-from fits.store import Store, another, differences, fingerprint, holds_other_files
+from fits.store import Store, another, differences, fingerprint, make_directory
 from layerjax._checks import require_count, require_kind, require_seed
 
 TABLE, STORE = "table.csv", "batch.store"
@@ -99,7 +99,7 @@ class FittedFiles:
     """What became of every file and stack.
 
     Attributes:
-        directory: where results, table and page are.
+        directory: where results and table are.
         rows: a mapping for each file and stack, as a line of the table: `file`, `stack`, `result` ("converged", "not
             converged" or "failed"), `status` (of the fit, or why there is none), `standing` among the stacks of the
             file; of a fit `criterion` and `loss`, by which stacks are ranked (-2 log predictive density of held-out
@@ -173,22 +173,12 @@ def fit_files(
         raise ValueError("no stack is given; there must be at least one")
     for problem in given.values():
         require_score(problem, bool(read_options.hold_out))
-    if not out.resolve().parent.is_dir():
-        raise ValueError(f"{out}: there is no directory {out.parent}")
-    if out.exists() and not out.is_dir():
-        raise ValueError(f"{out}: is a file, must be a directory")
-    if holds_other_files(out, STORE):
-        raise ValueError(
-            f"{out}: is not empty, and holds no fits of files (no {STORE} of theirs): choose another directory"
-        )
     how_read = {f"read {name}": value for name, value in vars(read_options).items()}
     if read_options.geometry is not None:
         how_read["read geometry"] = [read_options.geometry.wi, read_options.geometry.wo]
-    with named(out):
-        out.mkdir(exist_ok=True)
     job = Job(out.absolute(), given, read_options, {"starts": starts, "seed": seed, "report": reports})
 
-    with Store.open(out / STORE, fingerprint(of="fit-many")) as store:
+    with Store.open(make_directory(out, STORE), fingerprint(of="fit-many")) as store:
         # what is done, and what is left
         rows: dict[str, Row] = {}
         tasks: list[Task] = []

@@ -21,7 +21,6 @@ import numpy as np
 
 import layerjax as lj
 from fits._files import given_path
-from fits._files import named as errors_named
 from fits.data.measurements import TO_HAVE_THEM, Measurements
 from fits.optimise.fit import fit as run_fit
 from fits.optimise.options import DEFAULT, FitOptions
@@ -39,7 +38,7 @@ from fits.progress import Progress, given_progress
 from fits.reports.pages import Table
 from fits.reports.results import load_fit, save_fit
 from fits.reports.verdicts import listed, verdict
-from fits.store import Store, fingerprint, holds_other_files
+from fits.store import Store, fingerprint, make_directory
 from layerjax._checks import require_count, require_kind, require_number, require_seed
 from layerjax._numerics import broadcasting
 from layerjax.compiling import programs_kept
@@ -275,14 +274,12 @@ def search(
     store: Any = nullcontext()
     if directory is not None:
         directory, used = given_path("directory", directory), data.used()
-        if holds_other_files(directory, STORE):
-            raise ValueError(f"{directory}: is not empty, and holds no search")
-        with errors_named(directory):
-            directory.mkdir(parents=True, exist_ok=True)
         # how far it goes is no part of whose search it is: one may go on where another has ended
         starting = {"starts": options.starts, "seed": seed, "fit": options.fit}
         numbers = [used.wi, used.wo, used.values, used.sigma]
-        store = Store.open(directory / STORE, fingerprint(data=numbers, library=library, **settings, **starting))
+        store = Store.open(
+            make_directory(directory, STORE), fingerprint(data=numbers, library=library, **settings, **starting)
+        )
     with store as opened:
         work = _Work(data, library, settings, options, seed, opened, given_progress(progress))
         coarse: dict[Structure, Fit] = {}
