@@ -167,8 +167,9 @@ def fit_files(
     require_switch("reports", reports)
     require_switch("force", force)
     read_options, out, progress = read_options or ReadOptions(), given_path("out", out), given_progress(progress)
-    paths, skipped = _measurement_files(_several("files", files), read_options.format)
-    given = {path.stem: read_problem(path) for path in _named_apart(_several("stacks", stacks), lambda one: one.stem)}
+    files, stacks = _several("files", files), _several("stacks", stacks)
+    paths, skipped = _measurement_files(files, read_options.format)
+    given = {path.stem: read_problem(path) for path in _named_apart(stacks, lambda one: one.stem)}
     if not given:
         raise ValueError("no stack is given; there must be at least one")
     for problem in given.values():

@@ -170,7 +170,7 @@ def emulate(problem: Problem, options: MapOptions = DEFAULT) -> tuple[Emulator |
         solves = int(np.prod(terms))
         if solves > options.emulator_max_solves:
             break
-        options.report("emulator", 0, solves, " x ".join(map(str, terms)))
+        options.progress("emulator", 0, solves, " x ".join(map(str, terms)))
         emulator = _make(space, terms, offset, tolerance)
         # the largest error at points that were not solved for it, in standard deviations of the data
         points = 2.0 * qmc.Sobol(len(low), rng=np.random.default_rng(1)).random(CHECKS) - 1.0

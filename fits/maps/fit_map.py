@@ -170,14 +170,14 @@ def _fit_chunks(store: Store, job: Job, client: Any, options: MapOptions) -> lis
     blocks, failures = store.unfinished(), []
     total = sum(1 for _ in blocks_of(store.shape, store.chunk))
     done, poor, fitted = total - len(blocks), 0, 0
-    options.report("map", done, total)
+    options.progress("map", done, total)
     for index, result in run(work, job, blocks, client=client):
         if isinstance(result, Failure):
             failures.append(f"chunk {block_words(blocks[index])}: {result.error}")
         else:
             fitted, poor = fitted + result["fitted"], poor + result["poor"]
         done += 1
-        options.report("map", done, total, f"{100.0 * poor / fitted:.1f} % poor" if fitted else "")
+        options.progress("map", done, total, f"{100.0 * poor / fitted:.1f} % poor" if fitted else "")
     if client is None:  # of a cluster, some may still write what others have done
         store.clean()
     return failures

@@ -31,6 +31,7 @@ from fits.problem.noise import DEFAULT_FLOOR, DEFAULT_RELATIVE, Noise
 from fits.problem.parameters import Free, is_free
 from fits.problem.problem import Problem
 from fits.problem.stack_file import transport_from_dict, transport_to_dict
+from fits.progress import silent
 
 Floats = NDArray[np.float64]
 
@@ -194,12 +195,12 @@ def fit_pilot(
 
     common: dict[str, Any] = {}
     if problem.common_names:
-        options.report("common", 0, len(problem.common_names))
+        options.progress("common", 0, len(problem.common_names))
         common = fit_common(map_problem(problem, own_directions, None), texels, options)
         problem = with_common(problem, {name: one["value"] for name, one in common.items()})
 
     # the pilot, at finer resolutions until its noise hides their error
-    options.report("pilot", 0, texels.number)
+    options.progress("pilot", 0, texels.number)
     if own_directions and options.emulator:
         raise ValueError("emulator: there is none where every texel has directions of its own")
     pays = known is not None and np.prod(shape) >= options.emulator_min_texels
@@ -226,7 +227,7 @@ def fit_pilot(
             numerical["resolution"] = resolution_in_words(problem, known)
             break
         problem = fine
-    options.report("pilot", texels.number, texels.number)
+    options.progress("pilot", texels.number, texels.number)
 
     reduced = reduced_chi_square(results.fits, texels)
     finite = reduced[np.isfinite(reduced)]
@@ -259,7 +260,7 @@ def job_of(store: Store, problem: Problem, own_directions: bool, options: MapOpt
     emulator = Emulator.of(arrays) if "orders" in arrays else None
     ready, size = map_problem(problem, own_directions, emulator), options.chunk_size
     starts = starts_at(ready, arrays["starts"], own_directions, size, kept["poor_above"])
-    return Job(str(store.path.resolve()), problem, emulator, starts, replace(options, progress=None), data)
+    return Job(str(store.path.resolve()), problem, emulator, starts, replace(options, progress=silent), data)
 
 
 def _numerical_error(ready: Problem, fine: Problem, results: Results, texels: Texels) -> float:

@@ -116,7 +116,7 @@ def smooth_map(store: Store, job: Job, client: Any, options: MapOptions) -> None
 
     while len(moves) < prior.rounds and not (moves and moves[-1] <= options.settled):
         note = f"the farthest moved by {moves[-1]:.2g} errors" if moves else ""
-        options.report("smoothing", len(moves), prior.rounds, note)
+        options.progress("smoothing", len(moves), prior.rounds, note)
         before, errors_before = units_now(), errors.copy()
         for colour in (0, 1):
             units = units_now()
@@ -155,4 +155,4 @@ def smooth_map(store: Store, job: Job, client: Any, options: MapOptions) -> None
             dimension_names=store.arrays["flags"].metadata.dimension_names,
             fill_value=np.nan,
         )
-    options.report("smoothing", len(moves), prior.rounds)
+    options.progress("smoothing", len(moves), prior.rounds)

@@ -195,7 +195,7 @@ def test_force_keeps_what_is_of_the_same_fit_and_a_map_until_there_can_be_anothe
     calls = []
     thresholds = {"converged_share": 0.5, "chi_square_sigmas": 5.0}  # of verdicts: they make no other fit
     fitted(out, measured, force=True, **thresholds, progress=lambda *call: calls.append(call))
-    assert calls == [("map", 4, 4, "")]
+    assert calls == [("map", 4, 4)]
 
     def interrupt(stage, *_):
         assert stage == "pilot"
