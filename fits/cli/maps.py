@@ -52,9 +52,7 @@ def fit_map(arguments: Namespace) -> int:
         )
     found, common = report.summarise(map), report.common_table(map)
     show(report.count_table(found), report.quartile_table(found, map), *([common] if common.rows else []))
-    if prior is not None:
-        show(report.smoothing_words(map))
-    show(*report.noise_words(map), f"Store: {arguments.out}. For the report: layerjax report {arguments.out}")
+    show(*report.verdict(found, map)[0], f"Store: {arguments.out}. For the report: layerjax report {arguments.out}")
     whole = found.done == found.texels and found.fitted > 0
     return DONE if whole and found.converged >= map.option("converged_share") else DOUBTFUL
 

@@ -20,13 +20,12 @@ from scipy.stats import chi2
 from fits._files import write_text
 from fits.maps.options import MapOptions
 from fits.maps.store import FLAGS, FittedMap, Floats
-from fits.problem.noise import DEFAULT_RELATIVE
 from fits.progress import Progress, silent
 from fits.reports.pages import Table, document, html_table, image, made_with, section
 from fits.reports.pages import verdict as verdict_box
 from fits.reports.plots.data import GREY, LOG_ABOVE, STYLE, as_png
 from fits.reports.tables import with_error
-from fits.reports.verdicts import listed
+from fits.reports.verdicts import NOISE_ASSUMED, listed
 
 INNER = (1.0, 99.0)  # percentiles between which colours run
 WIDTH = 4.8  # inches
@@ -85,14 +84,6 @@ def summarise(map: FittedMap) -> Summary:
 # ---- in sentences ----
 
 
-def noise_words(map: FittedMap) -> list[str]:
-    """That a noise was assumed, where nothing says how large it is."""
-    if not map.attributes.get("noise_assumed"):
-        return []
-    level = f"{100.0 * DEFAULT_RELATIVE:g} %"
-    return [f"No noise is stated: {level} of the model's value is assumed. State it as `relative`, or by `--noise`."]
-
-
 def verdict(summary: Summary, map: FittedMap) -> tuple[list[str], bool]:
     """How far the map can be relied on, in a few sentences, and whether they are without reservation."""
     counts, fitted, option, about = summary.counts, summary.fitted, map.option, map.attributes
@@ -110,7 +101,8 @@ def verdict(summary: Summary, map: FittedMap) -> tuple[list[str], bool]:
     converged = counts["converged"] >= option("converged_share") * (fitted + counts["failed"])
 
     # chi-square beside what noise makes of it
-    words += (assumed := noise_words(map))
+    assumed = about.get("noise_assumed", False)
+    words += [NOISE_ASSUMED] if assumed else []
     low, median, high = summary.quartiles["reduced_chi_square"]
     own = [name for name in map.names if name not in about["common"]]
     freedom = summary.quartiles["measurements"][1] - len(own)
@@ -155,21 +147,23 @@ def verdict(summary: Summary, map: FittedMap) -> tuple[list[str], bool]:
     if map.numerical_error is not None:
         but = "" if accurate else ": a finer resolution may give other values"
         words.append(f"The numerical error of the model is at most {error:.2g} standard deviations in the pilot{but}.")
+    words += smoothing_words(map)
     return words, finished and converged and explained and few_flagged and joint and not unknown and accurate
 
 
-def smoothing_words(map: FittedMap) -> str:
-    """How a map was smoothed, and whether that has settled, in a few sentences; nothing if it was not."""
+def smoothing_words(map: FittedMap) -> list[str]:
+    """How a map was smoothed, and whether that has settled, in a few sentences; none if it was not."""
     about = map.smoothing
     if about is None:
-        return ""
+        return []
     scales, settled = about["prior"]["scale"], "" if about["settled"] else ": it has not settled"
-    return (
+    each = ", ".join(f"{name} {one:g}" for name, one in scales.items())
+    return [
         f"Smoothed beside the plain fit by block alternation ({about['prior']['kind'].replace('_', ' ')}, of the "
-        f"bounds: {', '.join(f'{name} {one:g}' for name, one in scales.items())}), in {about['rounds']} rounds; in the "
-        f"last one texels moved by at most {about['largest_moves'][-1]:.2g} standard errors{settled}. "
-        "Errors of the smoothed map are conditional on the values of the neighbours."
-    )
+        f"bounds: {each}), in {about['rounds']} rounds; in the last one texels moved by at most "
+        f"{about['largest_moves'][-1]:.2g} standard errors{settled}.",
+        "Errors of the smoothed map are conditional on the values of the neighbours.",
+    ]
 
 
 def share(part: float, whole: float) -> str:
@@ -258,7 +252,6 @@ def report(map: FittedMap, path: str | Path, force: bool = True, progress: Progr
     if numbers.fitted:
         body.append(section("Values in short", quartile_table(numbers, map), common_table(map)))
         parts = ['<p class="note">Colours run over the middle 98 % of the values.</p>']
-        parts.append(f"<p>{html.escape(smoothing_words(map))}</p>")
         for number, name in enumerate(map.names):
             progress("pictures", number, len(map.names), name)
             unit, norm = "unitless" if map.units[name] == "1" else map.units[name], inner_norm(map.values[name])
