@@ -60,9 +60,7 @@ Checked = tuple[Fit, CrossValidation, Evidence]
 class Library:
     """Layers and bases by name; a base is a surface, or a stack of its own that lets no light pass.
 
-    Raises:
-        ValueError: no layer or base, or a name that would be no name of a file, or that of another part: they are
-            letters, digits, blanks, hyphens and underscores, and differ by more than case, blanks and hyphens.
+    Names are letters, digits, blanks, hyphens and underscores, and differ by more than case, blanks and hyphens.
     """
 
     layers: Mapping[str, lj.Interface | lj.Medium]

@@ -1,15 +1,12 @@
 """A spatial prior: neighbouring texels held together, by block alternation beside the plain fit and after it.
 
-Texels are coloured like a chessboard, so that no edge joins two of one colour. With the other colour held, the
-posterior of the whole map falls apart into texels: each has its measurements, its prior, and a Gaussian that draws it
-to its neighbours. Every half round lowers minus the log-posterior of the map, or leaves it where it is; its limit is a
-minimum, though not of all minima the lowest. A texel moves no farther in a round than its neighbours allow: where the
-spatial prior weighs much more than the data, many rounds are needed.
+Texels are coloured like a chessboard, so that no edge joins two of one colour. With the other colour held, each texel
+has a posterior of its own: its measurements, its prior, and a Gaussian that draws it to its neighbours. Every half
+round lowers minus the log-posterior of the map, or leaves it where it is. Where the spatial prior weighs much more than
+the data, many rounds are needed. Edges join fitted texels that lie side by side along an axis of the map.
 
-All is said in the coordinate of the fit, the unit box: 0 and 1 are the bounds of a parameter, between which it runs in
-the value, or in its logarithm for the priors `LogUniform` and `LogNormal`. Edges lead from each texel to those beside
-it along the axes of the map, and join fitted texels alone. After each round the state is kept in the store as the group
-``smoothed``, from which an interrupted run resumes.
+Differences are in the unit box, between the bounds of a parameter or of its logarithm (`LogUniform`, `LogNormal`). The
+state after each round is the group ``smoothed`` of the store, from which an interrupted run resumes.
 """
 
 import json

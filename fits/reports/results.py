@@ -58,9 +58,9 @@ def save_fit(fit: "Fit", directory: str | Path, force: bool = False) -> None:
         force: replace an earlier result.
 
     Raises:
-        ValueError: `directory` is not empty, unless `force` is given and it holds an earlier result; the transport is a
-            callable, or it or a part of the stack is of a class of one's own, which a file cannot name; or a channel
-            cannot be written (see `write_csv`); or the fit is of several measurements (see `Fit.part`).
+        ValueError: `directory` is not empty, unless `force` is given and it holds an earlier result; the transport or a
+            part of the stack is a function or class of one's own, which a file cannot name; the fit is of several
+            measurements (see `Fit.part`).
     """
     from fits.optimise.result import Fit
     from layerjax._checks import require_kind
