@@ -1,12 +1,13 @@
-"""Work that survives: what grows while it is computed, each finished piece a line of one file.
+"""Work that survives: what grows while it is computed, each finished piece a record of one SQLite file.
 
 The starts of a fit, the steps of a chain, the candidates of a search and the rows of a batch are kept in this way. A
-file only grows, and a record counts once its line has an end: a process that is killed, or a disk that is full, costs
-the record that was being written and no other.
+record is written in a transaction, so that a process which is killed, or a disk which is full, costs the record that
+was being written and no other. SQLite's rollback journal is used, not its write-ahead log, which does not work on
+network file systems.
 
-One process writes, and holds a lock file beside the store while it does. Readers need no lock and change nothing. Every
-line carries a checksum, so that damage is reported instead of read. A fingerprint says whose work the store holds; the
-work of another problem is refused.
+One process writes, and holds a lock file beside the store while it does. Readers take a copy: they need no lock, change
+nothing, and hold up nobody. Every record carries a checksum, so that damage is reported instead of read. A fingerprint
+says whose work the store holds; the work of another problem is refused.
 
     with Store.open("chain.store", fingerprint(data=values, seed=0)) as store:
         store.put("moves", {"kind": "stretch"})                        # one record a key, the last one counts
@@ -22,22 +23,33 @@ import base64
 import errno
 import hashlib
 import json
-import os
 import re
+import sqlite3
+import tempfile
 import threading
 import zlib
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, closing, contextmanager, suppress
 from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
 
-from fits._files import locked, named, require_there, write_bytes
+from fits._files import locked, require_there
 
-HEAD = b"layerjax store 3"
-"""First line of every store, with the version of its layout; others are checksum, kind, key and record."""
+APPLICATION = 0x6C6A7802
+"""SQLite's application_id of a store; its last digits are the version of the layout."""
+_LAYOUT = """
+CREATE TABLE records (number INTEGER PRIMARY KEY, key TEXT, checksum INTEGER, text TEXT);
+"""
 _ARRAY, _WHOSE = "numpy", "fingerprint"
+_NO_ROOM = (sqlite3.SQLITE_FULL, sqlite3.SQLITE_IOERR_WRITE, sqlite3.SQLITE_IOERR_FSYNC, sqlite3.SQLITE_IOERR_TRUNCATE)
+_OF_SYSTEM = {
+    sqlite3.SQLITE_READONLY: errno.EACCES,
+    sqlite3.SQLITE_CANTOPEN: errno.EACCES,
+    sqlite3.SQLITE_PERM: errno.EACCES,
+    sqlite3.SQLITE_IOERR: errno.EIO,
+}
 _LONGEST = 60  # letters of a value that a fingerprint shows
 
 
@@ -49,21 +61,10 @@ class Store:
         fingerprint: whose work it holds; empty before the first record was written.
     """
 
-    def __init__(self, path: Path, content: bytes):
-        """The records of this content; ValueError if it is no store, or not as it was written."""
+    def __init__(self, path: Path, connection: sqlite3.Connection):
         self.path = path
-        self._records: dict[str, list[str]] = {}
-        self._lock = threading.Lock()
-        self._size = content.rfind(b"\n") + 1  # behind it is what a killed process has not finished
-        head, *lines = content[: self._size].splitlines() or [b""]
-        for line in lines if head == HEAD else ():
-            checksum, _, row = line.partition(b"\t")
-            if checksum != _checksum(row):
-                raise ValueError(damaged(path))
-            self._keep(row)
-        self.fingerprint: dict[str, str] = self.get(_WHOSE) or {}
-        if content and not self.fingerprint:
-            raise ValueError(damaged(path))
+        self._connection, self._turn = connection, threading.RLock()
+        self.fingerprint: dict[str, str] = self._checked()
 
     @classmethod
     @contextmanager
@@ -83,30 +84,41 @@ class Store:
             OSError: names the file: no room or no permission to write.
         """
         path = Path(path)
-        with locked(path.with_name(f"{path.name}.lock"), str(path)):
-            store = cls(path, b"" if fresh or not path.exists() else path.read_bytes())
-            different = differences(store.fingerprint, fingerprint) if store.fingerprint else ""
-            if different and not replace:
-                raise ValueError(another(path, different))
-            if different or not store.fingerprint:
-                content = HEAD + b"\n" + _line(_WHOSE, dict(fingerprint), "put")
-                write_bytes(path, content, force=True)
-                store = cls(path, content)
-            os.truncate(path, store._size)
+        with locked(path.with_name(f"{path.name}.lock"), str(path)), ExitStack() as stack:
+            with _errors_of(path):
+                if fresh:
+                    for one in (path, _journal(path)):
+                        one.unlink(missing_ok=True)
+                _require_store(path)
+                # the lock file is what keeps others out: SQLite's own locks do not hold on every file system
+                place = f"{path.resolve().as_uri()}?nolock=1"
+                connection = sqlite3.connect(place, uri=True, check_same_thread=False)
+                stack.enter_context(closing(connection))
+                connection.execute("PRAGMA synchronous = NORMAL")
+                store = cls(path, connection)
+                different = differences(store.fingerprint, fingerprint) if store.fingerprint else ""
+                if different and not replace:
+                    raise ValueError(another(path, different))
+                if different or not store.fingerprint:
+                    store._begin(dict(fingerprint))
             yield store
 
     @classmethod
     def read(cls, path: str | Path) -> Self:
-        """The records as they are now, though another process may be writing.
+        """The records as they are now, though another process may be writing: a copy in memory.
 
         FileNotFoundError: there is no such file. ValueError: it is damaged, or no store.
         """
+        path = Path(path)
         require_there(path)
-        return cls(Path(path), Path(path).read_bytes())
+        with _errors_of(path):
+            _require_store(path)
+            return cls(path, _copied(path))
 
     def keys(self) -> list[str]:
-        """Keys of all records, in the order in which they were first written."""
-        return [key for key in self._records if key != _WHOSE]
+        """Keys of all records, in the order in which they were written."""
+        rows = self._select("SELECT key FROM records ORDER BY number") if self.fingerprint else []
+        return list(dict.fromkeys(key for (key,) in rows if key != _WHOSE))
 
     def get(self, key: str) -> Any:
         """The record of a key, the last one of several; None without any."""
@@ -114,48 +126,51 @@ class Store:
 
     def all(self, key: str) -> list[Any]:
         """The records that were appended to a key."""
-        return [json.loads(text, object_hook=_decoded) for text in self._records.get(key, ())]
+        rows = self._select("SELECT text FROM records WHERE key = ? ORDER BY number", key) if self.fingerprint else []
+        return [json.loads(text, object_hook=_decoded) for (text,) in rows]
 
     def put(self, key: str, record: Any) -> None:
         """Keep a record in the place of what the key has."""
-        self._write(_line(key, record, "put"))
+        self._write(key, record, replace=True)
 
     def append(self, key: str, record: Any) -> None:
         """Keep a record behind those that the key has."""
-        self._write(_line(key, record, "append"))
+        self._write(key, record, replace=False)
 
-    def _write(self, line: bytes) -> None:
-        with self._lock, named(self.path):
-            if self.path.stat().st_size != self._size:
-                raise OSError(errno.EIO, "Replaced, or changed, while it was written")
-            try:
-                with open(self.path, "r+b") as file:
-                    file.seek(self._size)
-                    file.write(line)
-                    file.flush()
-                    os.fsync(file.fileno())
-            except OSError:
-                with suppress(OSError):
-                    os.truncate(self.path, self._size)
-                raise
-            self._size += len(line)
-            self._keep(line.rstrip(b"\n").partition(b"\t")[2])
+    def _write(self, key: str, record: Any, replace: bool) -> None:
+        text = json.dumps(record, default=_encoded)
+        row = (key, _checksum(key, text), text)
+        with self._turn, _errors_of(self.path), self._connection:  # a transaction
+            if replace:
+                self._connection.execute("DELETE FROM records WHERE key = ?", (key,))
+            self._connection.execute("INSERT INTO records (key, checksum, text) VALUES (?, ?, ?)", row)
 
-    def _keep(self, row: bytes) -> None:
-        kind, key, record = row.decode().split("\t")
-        if kind == "put":
-            self._records[json.loads(key)] = []
-        self._records.setdefault(json.loads(key), []).append(record)
+    def _begin(self, fingerprint: dict[str, str]) -> None:
+        """Without records, of this problem."""
+        with self._connection:
+            self._connection.execute("BEGIN")
+            self._connection.execute("DROP TABLE IF EXISTS records")
+            self._connection.execute(_LAYOUT)
+            self._connection.execute(f"PRAGMA application_id = {APPLICATION}")
+            self.fingerprint = fingerprint
+            self._write(_WHOSE, fingerprint, replace=True)
 
+    def _checked(self) -> dict[str, str]:
+        """The fingerprint. ValueError if records are not as they were written."""
+        ((application,),), tables = self._select("PRAGMA application_id"), self._select("SELECT * FROM sqlite_schema")
+        if not application and not tables:
+            return {}  # killed before it was begun
+        if application != APPLICATION or self._select("PRAGMA integrity_check") != [("ok",)]:
+            raise ValueError(damaged(self.path))
+        rows = self._connection.execute("SELECT key, checksum, text FROM records ORDER BY number")
+        if not all(stored == _checksum(key, text) for key, stored, text in rows):
+            raise ValueError(damaged(self.path))
+        ((whose,),) = self._select("SELECT text FROM records WHERE key = ?", _WHOSE)
+        return json.loads(whose)
 
-def _line(key: str, record: Any, kind: str) -> bytes:
-    """A record as a line: JSON holds no tabs and no ends of lines."""
-    row = "\t".join((kind, json.dumps(key), json.dumps(record, default=_encoded))).encode()
-    return _checksum(row) + b"\t" + row + b"\n"
-
-
-def _checksum(row: bytes) -> bytes:
-    return b"%08x" % zlib.crc32(row)
+    def _select(self, statement: str, *values: str) -> list[Any]:
+        with self._turn, _errors_of(self.path):
+            return self._connection.execute(statement, values).fetchall()
 
 
 def make_directory(directory: Path, store: str) -> Path:
@@ -246,3 +261,64 @@ def _decoded(table: dict[str, Any]) -> Any:
         return table
     array = np.frombuffer(base64.b64decode(table["data"]), table[_ARRAY]).reshape(table["shape"])
     return array.copy() if array.shape else array[()]
+
+
+def _checksum(key: str, text: str) -> int:
+    return zlib.crc32(f"{len(key)} {key} {text}".encode())
+
+
+def _require_store(path: Path) -> None:
+    """ValueError for a file that is something else."""
+    if path.is_file():
+        with open(path, "rb") as file:
+            begin = file.read(16)
+        if begin not in (b"", b"SQLite format 3\0"):
+            raise ValueError(damaged(path))
+
+
+def _copied(path: Path) -> sqlite3.Connection:
+    """The last whole state of a database in memory, from its file and the journal of a writer at work or killed."""
+    while True:
+        before, content = _state(path), path.read_bytes()
+        if _state(path) == before:  # nobody has written in the meantime
+            break
+    memory = sqlite3.connect(":memory:", check_same_thread=False)
+    with tempfile.TemporaryDirectory() as folder:  # SQLite takes back what was not finished
+        copy = Path(folder) / "copy"
+        copy.write_bytes(content)
+        if journal := before[1]:
+            _journal(copy).write_bytes(journal)
+        with closing(sqlite3.connect(copy)) as connection:
+            connection.backup(memory)
+    return memory
+
+
+def _state(path: Path) -> tuple[bytes, bytes]:
+    """What every transaction changes: the header, which counts them, and the journal."""
+    with open(path, "rb") as file:
+        header = file.read(100)
+    with suppress(FileNotFoundError):
+        return header, _journal(path).read_bytes()
+    return header, b""
+
+
+def _journal(path: Path) -> Path:
+    return path.with_name(f"{path.name}-journal")
+
+
+@contextmanager
+def _errors_of(path: Path) -> Iterator[None]:
+    """SQLite's errors in the block as those of the operating system that they are, or of a file that is damaged."""
+    try:
+        yield
+    except sqlite3.Error as error:
+        code = getattr(error, "sqlite_errorcode", sqlite3.SQLITE_ERROR)
+        if code in _NO_ROOM:
+            raise OSError(errno.ENOSPC, "No space left on device, or more than a quota allows", str(path)) from None
+        if code == sqlite3.SQLITE_READONLY_DBMOVED:
+            raise OSError(errno.ENOENT, "Removed, or replaced, while it was written", str(path)) from None
+        if code & 0xFF in _OF_SYSTEM:
+            raise OSError(_OF_SYSTEM[code & 0xFF], str(error).capitalize(), str(path)) from None
+        raise ValueError(damaged(path)) from None
+    except (UnicodeError, TypeError, LookupError):  # what stands there is of another kind
+        raise ValueError(damaged(path)) from None

@@ -121,7 +121,7 @@ def test_every_structure_has_the_instrument_and_another_search_is_refused(data, 
     refused(r"is not empty, and holds no search\.store", directory=tmp_path / "other")
     with locked(store.with_name(f"{STORE}.lock"), "it"):
         refused("in use by another process")
-    store.write_bytes(before[str(store)].replace(b"cross", b"Cross"))
+    store.write_bytes(before[str(store)][:6000])
     refused(rf"{STORE}: damaged")
 
 

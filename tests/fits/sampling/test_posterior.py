@@ -233,7 +233,7 @@ def test_a_chain_of_something_else_is_refused(result: Fit, tmp_path: Path) -> No
     with jax.enable_x64(False), pytest.raises(ValueError, match="precision float64, not float32"):
         load(result, path)
     assert len(sample(other, walkers=16, seed=2, path=path, resume=False, max_steps=100).chain) == 100
-    path.write_bytes(b"no store")
+    path.write_bytes(b"not SQLite")
     with pytest.raises(ValueError, match="no store of this version"):
         sample(result, walkers=16, seed=1, path=path)
 
