@@ -19,7 +19,7 @@ from fits.data.formats import sniff
 from fits.data.formats.csv import write_csv
 from fits.data.measurements import Measurements
 from fits.data.reading import ReadOptions
-from fits.engines import Failure, run
+from fits.engines import Failure, one_line, run
 from fits.optimise.fit import discrepancy_checkpoint
 from fits.optimise.fit import fit as run_fit
 from fits.optimise.options import options_from
@@ -184,7 +184,12 @@ def fit_files(
         rows: dict[str, Row] = {}
         tasks: list[Task] = []
         for path in paths:
-            content = text_checksum(path)
+            try:
+                content = text_checksum(path)
+            except OSError as error:
+                failed = [Task(path, name, {}).failed(one_line(error)) for name in given]
+                rows |= {f"{row['file']}/{row['stack']}": row for row in failed}
+                continue
             for name, problem in given.items():
                 whose = fingerprint(file=content, stack=problem.text, **how_read, starts=starts, seed=seed)
                 # workers of a cluster have another working directory
