@@ -52,8 +52,7 @@ def main():
         for index, (parameter, value) in enumerate(fit.values.items()):
             print(f"  {parameter:16} truth {truths[parameter]:5.3f}  fit {value:6.4f} ± {fit.errors[index]:.4f}")
     print()
-    for sentence in fits.compare(found).verdict:
-        print(sentence)
+    print(fits.compare(found).verdict)
     fits.report(found["VMF diffuse, all orders"], path=out / "sand.html")
 
 

@@ -4,6 +4,7 @@ import errno
 import json
 import math
 import os
+import shutil
 import tempfile
 import zlib
 from collections.abc import Iterator, Mapping
@@ -14,6 +15,8 @@ from typing import Any
 import numpy as np
 
 CHECKSUM = "checksum"
+PARTIAL = ".partial"
+"""How names of directories end, here and in zarr, that have not been written to their end."""
 _UMASK = os.umask(0)  # it can only be read by setting it: once, before other threads make files
 os.umask(_UMASK)
 
@@ -76,6 +79,37 @@ def write_bytes(path: str | Path, content: bytes, force: bool = False, durable: 
         except BaseException:
             os.unlink(temporary)
             raise
+
+
+@contextmanager
+def replacing(target: Path) -> Iterator[Path]:
+    """A new folder beside a directory that takes its place when the block ends well, and is removed when it does not.
+
+    One process at a time may do so: the caller holds a lock.
+    """
+    restore(target)
+    new, old = _scratch(target)
+    try:
+        new.mkdir()
+        yield new
+        if target.exists():
+            target.rename(old)
+        new.rename(target)
+    finally:
+        restore(target)
+
+
+def restore(target: Path) -> None:
+    """Tidy up what a process that was killed left beside a directory: half of a new one goes, an old one comes back."""
+    new, old = _scratch(target)
+    if old.exists() and not target.exists():
+        old.rename(target)
+    for left in (new, old):
+        shutil.rmtree(left, ignore_errors=True)
+
+
+def _scratch(target: Path) -> tuple[Path, Path]:
+    return target.with_name(f".{target.name}.new{PARTIAL}"), target.with_name(f".{target.name}.old{PARTIAL}")
 
 
 def write_json(path: Path, content: Mapping[str, Any], force: bool = False) -> None:

@@ -9,7 +9,7 @@ import csv
 import io
 import math
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -30,7 +30,7 @@ from fits.progress import Progress, given_progress, silent
 from fits.reports import results, tables
 from fits.reports.html import FitReport
 from fits.reports.verdicts import listed
-from fits.store import Store, another, differences, fingerprint, holds_other_files
+from fits.store import Store, another, differences, fingerprint, make_directory
 from layerjax._checks import require_count, require_kind, require_seed
 
 TABLE, STORE = "table.csv", "batch.store"
@@ -99,7 +99,7 @@ class FittedFiles:
     """What became of every file and stack.
 
     Attributes:
-        directory: where results, table and page are.
+        directory: where results and table are.
         rows: a mapping for each file and stack, as a line of the table: `file`, `stack`, `result` ("converged", "not
             converged" or "failed"), `status` (of the fit, or why there is none), `standing` among the stacks of the
             file; of a fit `criterion` and `loss`, by which stacks are ranked (-2 log predictive density of held-out
@@ -119,12 +119,8 @@ class FittedFiles:
 
     @property
     def best(self) -> dict[str, str]:
-        """The stack of the lowest loss of each file, or the only one that was fitted."""
-        fitted = [row for row in self.rows if row["result"] != "failed"]
-        files = [row["file"] for row in fitted]
-        return {
-            row["file"]: row["stack"] for row in fitted if row["standing"] == "best" or files.count(row["file"]) == 1
-        }
+        """The stack of the lowest loss of each file, where losses can be compared."""
+        return {row["file"]: row["stack"] for row in self.rows if row["standing"] == "best"}
 
 
 def fit_files(
@@ -160,7 +156,7 @@ def fit_files(
 
     Raises:
         FileNotFoundError: no such file.
-        ValueError: no file can be read; names that are there twice; a result of another stack or settings, unless
+        ValueError: no file or stack is given; names that are there twice; a result of another stack or settings, unless
             `force`; a directory in use, or that holds something else; as `fits.engines.connected`.
     """
     # what is fitted by what
@@ -173,31 +169,36 @@ def fit_files(
     read_options, out, progress = read_options or ReadOptions(), given_path("out", out), given_progress(progress)
     files, stacks = _several("files", files), _several("stacks", stacks)
     paths, skipped = _measurement_files(files, read_options.format)
-    given = {name: read_problem(path) for name, path in _by_name((one, one.stem) for one in stacks).items()}
+    given = {path.stem: read_problem(path) for path in _named_apart(stacks, lambda one: one.stem)}
     if not given:
         raise ValueError("no stack is given; there must be at least one")
     for problem in given.values():
         require_score(problem, bool(read_options.hold_out))
-    job = Job(out.absolute(), given, read_options, {"starts": starts, "seed": seed}, reports, force)
-    if not out.resolve().parent.is_dir():
-        raise ValueError(f"{out}: there is no directory {out.parent}")
-    if out.exists() and not out.is_dir():
-        raise ValueError(f"{out}: is a file, must be a directory")
-    if holds_other_files(out, STORE):
-        raise ValueError(
-            f"{out}: is not empty, and holds no fits of files (no {STORE} of theirs): choose another directory"
-        )
-    # what is done, and what is left
-    done = Store.read(out / STORE) if (out / STORE).is_file() else None
-    # workers of a cluster have another working directory
-    rows, tasks = _planned(job, [path if client is None else path.absolute() for path in paths.values()], done)
-    if not tasks and all(row["result"] == "failed" for row in rows.values()):
-        reasons = list(dict.fromkeys(row["status"] for row in rows.values()))
-        raise ValueError(f"no file can be fitted: {'; '.join(reasons[:3])}")
-    # fits, each row kept as it is there; the table also of what is there when they are interrupted
-    with named(out):
-        out.mkdir(exist_ok=True)
-    with Store.open(out / STORE, fingerprint(of="fit-many")) as store:
+    how_read = {f"read {name}": value for name, value in vars(read_options).items()}
+    if read_options.geometry is not None:
+        how_read["read geometry"] = [read_options.geometry.wi, read_options.geometry.wo]
+    job = Job(out.absolute(), given, read_options, {"starts": starts, "seed": seed, "report": reports})
+
+    with Store.open(make_directory(out, STORE), fingerprint(of="fit-many")) as store:
+        # what is done, and what is left
+        rows: dict[str, Row] = {}
+        tasks: list[Task] = []
+        for path in paths:
+            try:
+                content = text_checksum(path)
+            except OSError as error:
+                failed = [Task(path, name, {}).failed(one_line(error)) for name in given]
+                rows |= {f"{row['file']}/{row['stack']}": row for row in failed}
+                continue
+            for name, problem in given.items():
+                whose = fingerprint(file=content, stack=problem.text, **how_read, starts=starts, seed=seed)
+                # workers of a cluster have another working directory
+                task = Task(path if client is None else path.absolute(), name, whose)
+                row = _kept_row(out, task, store, force)
+                rows[task.key] = row or task.failed("not done yet")
+                tasks += [] if row else [task]
+        tasks.sort(key=lambda task: list(given).index(task.stack))  # fits of a stack share programs
+        # fits, each row kept as it is there; the table also of what is there when they are interrupted
         total, count = len(rows), len(rows) - len(tasks)
         progress("fits", count, total)
         try:
@@ -207,12 +208,11 @@ def fit_files(
                 if isinstance(outcome, Failure):
                     outcome = task.failed(outcome.error)
                 else:
-                    store.put(task.key, {"of": job.fingerprint(task), "row": outcome})
+                    store.put(task.key, {"of": task.fingerprint, "row": outcome})
                 rows[task.key] = outcome
                 progress("fits", count, total, f"{task.path.name} by {task.stack}")
         finally:
-            every = [row if _is_there(out, row) else _removed(row) for row in rows.values()]
-            result = FittedFiles(out, ranked(every), skipped)
+            result = FittedFiles(out, ranked(list(rows.values())), skipped)
             write_text(out / TABLE, table_csv(result.rows), force=True)
     return result
 
@@ -222,8 +222,8 @@ def _several(name: str, items: str | Path | Sequence[str | Path]) -> list[Path]:
     return [given_path(name, item) for item in many]
 
 
-def _measurement_files(places: Sequence[Path], format: str | None) -> tuple[dict[str, Path], tuple[str, ...]]:
-    """Files by name, those of folders among them; and what folders hold that are no measurements.
+def _measurement_files(places: Sequence[Path], format: str | None) -> tuple[list[Path], tuple[str, ...]]:
+    """Files, those of folders among them; and what folders hold that are no measurements.
 
     FileNotFoundError: no such file or folder. ValueError: no measurements, or a name that is there twice.
     """
@@ -246,26 +246,26 @@ def _measurement_files(places: Sequence[Path], format: str | None) -> tuple[dict
             files.append(place)
     if not files:
         raise ValueError(f"{', '.join(map(str, places))}: no measurement file is given; there must be at least one")
-    return _by_name((path, path.name) for path in files), tuple(skipped)
+    if of_batch := [path for path in files if path.name in (TABLE, STORE)]:
+        raise ValueError(f"{of_batch[0]}: the batch has a file of this name, give it another")
+    return _named_apart(files, lambda path: path.name), tuple(skipped)
 
 
-def _by_name(names: Iterable[tuple[Path, str]]) -> dict[str, Path]:
-    """The paths by name. ValueError for a name that is there twice, or taken."""
-    paths: dict[str, Path] = {TABLE: Path(TABLE), STORE: Path(STORE)}
-    for path, name in names:
-        if name in paths:
-            raise ValueError(f"{paths[name]} and {path}: results go by this name, which must differ")
-        paths[name] = path
-    del paths[TABLE], paths[STORE]
+def _named_apart(paths: list[Path], name: Callable[[Path], str]) -> list[Path]:
+    """These paths, or ValueError for two of one name."""
+    first: dict[str, Path] = {}
+    for path in paths:
+        if (other := first.setdefault(name(path), path)) is not path:
+            raise ValueError(f"{other} and {path}: results go by this name, which must differ")
     return paths
 
 
 class Task(NamedTuple):
-    """A file, by its path and the checksum of its content, and the name of a stack."""
+    """A file, the name of a stack, and what a result is made of."""
 
     path: Path
-    content: str
     stack: str
+    fingerprint: dict[str, str]
 
     @property
     def key(self) -> str:
@@ -277,73 +277,30 @@ class Task(NamedTuple):
         return {"file": self.path.name, "stack": self.stack, "result": "failed", "status": why}
 
 
-@dataclass(frozen=True)
-class Job:
-    """What all tasks have in common: where results go, stacks, and how files are read and fitted."""
+class Job(NamedTuple):
+    """What all tasks have in common: where results go, stacks by name, and how files are read and fitted."""
 
     out: Path
     stacks: Mapping[str, ProblemFile]
     read_options: ReadOptions
     fitting: Mapping[str, Any]
-    reports: bool
-    force: bool
-
-    def fingerprint(self, task: Task) -> dict[str, str]:
-        """What a result is made of."""
-        at = self.read_options.geometry
-        how_read = {f"read {name}": value for name, value in vars(self.read_options).items()}
-        how_read["read geometry"] = None if at is None else [at.wi, at.wo]
-        return fingerprint(file=task.content, stack=self.stacks[task.stack].text, **how_read, **self.fitting)
-
-    def kept_row(self, task: Task, done: Store | None) -> Row | None:
-        """The row of a result that is there; None: it is to be fitted, or again where it is damaged.
-
-        ValueError: a result of another file, stack or settings is in its place.
-        """
-        record = None if done is None else done.get(task.key)
-        if record is None:
-            return None
-        words = differences(record["of"], self.fingerprint(task))
-        if words and not self.force:
-            raise ValueError(f"{another(self.out / task.key, words)}; --force, or force=True, fits it again")
-        try:
-            read_json(self.out / task.key / results.FIT)
-        except (ValueError, OSError):
-            return None
-        return None if words else record["row"]
 
 
-def _planned(job: Job, files: list[Path], done: Store | None) -> tuple[dict[str, Row], list[Task]]:
-    """A row for each file and stack, in order, and the tasks that are left, stack by stack: fits share programs."""
-    rows: dict[str, Row] = {}
-    tasks: list[Task] = []
-    for path in files:
-        try:
-            content = text_checksum(path)
-        except OSError as error:
-            failed = [Task(path, "", name).failed(one_line(error)) for name in job.stacks]
-            rows |= {f"{row['file']}/{row['stack']}": row for row in failed}
-            continue
-        every = [Task(path, content, name) for name in job.stacks]
-        kept = {task.key: job.kept_row(task, done) for task in every}
-        left, why = [task for task in every if kept[task.key] is None], "not done yet"
-        try:
-            if left:
-                job.read_options.split(path)  # before any is fitted
-            tasks += left
-        except (ValueError, OSError) as error:
-            why = one_line(error)
-        rows |= {task.key: kept[task.key] or task.failed(why) for task in every}
-    return rows, sorted(tasks, key=lambda task: list(job.stacks).index(task.stack))
+def _kept_row(out: Path, task: Task, store: Store, force: bool) -> Row | None:
+    """The row of a result that is there; None: it is to be fitted, or again where it is damaged.
 
-
-def _is_there(out: Path, row: Row) -> bool:
-    """Whether a row has no result, or has it still: others may remove one while the rest are fitted."""
-    return row["result"] == "failed" or (out / row["file"] / row["stack"] / results.FIT).is_file()
-
-
-def _removed(row: Row) -> Row:
-    return Task(Path(row["file"]), "", row["stack"]).failed("its result was removed during the run; run it again")
+    ValueError: a result of another file, stack or settings is in its place, unless `force`.
+    """
+    if (record := store.get(task.key)) is None:
+        return None
+    words = differences(record["of"], task.fingerprint)
+    if words and not force:
+        raise ValueError(f"{another(out / task.key, words)}; --force, or force=True, fits it again")
+    try:
+        read_json(out / task.key / results.FIT)
+    except (ValueError, OSError):
+        return None
+    return None if words else record["row"]
 
 
 def fit_one(job: Job, task: Task) -> Row:
@@ -358,8 +315,7 @@ def fit_one(job: Job, task: Task) -> Row:
         data, held_out = job.read_options.split(task.path)
         with named(directory.parent):
             directory.parent.mkdir(exist_ok=True)
-        options = {"force": True, "report": job.reports, **job.fitting}
-        whole = fit_file(directory, job.stacks[task.stack], data, held_out, **options)
+        whole = fit_file(directory, job.stacks[task.stack], data, held_out, force=True, **job.fitting)
     except (ValueError, OSError):
         raise
     except Exception as error:
@@ -390,7 +346,7 @@ def ranked(rows: Sequence[Row]) -> tuple[Row, ...]:
     standing: dict[int, str] = {}
     for file in {row["file"] for row in rows}:
         own = [row for row in rows if row["file"] == file and math.isfinite(row.get("loss", math.nan))]
-        if len(own) > 1 and len({row["criterion"] for row in own}) == 1:
+        if len({row["criterion"] for row in own}) == 1:
             best = min(own, key=lambda row: (row["result"] != "converged", row["loss"]))
             standing |= {id(row): f"{row['loss'] - best['loss']:+.1f}" for row in own} | {id(best): "best"}
     return tuple(row | {"standing": standing.get(id(row), "")} for row in rows)
@@ -416,8 +372,7 @@ def table_csv(rows: Sequence[Row]) -> str:
 def overview(rows: Sequence[Row], most: int) -> tables.Table:
     """A row each, without the parameters."""
     columns = ["file", "stack", "result", "standing", "reduced_chi_square", "criterion", "loss", "seconds", "status"]
-    # all of the status is in the table and in the report of the fit
-    shown = [tuple("; ".join(_cell(row.get(name, ""), 4).split("; ")[:2]) for name in columns) for row in rows]
+    shown = [tuple(_cell(row.get(name, ""), 4) for name in columns) for row in rows]
     note = "Standing: among the stacks of a file, by -2 log predictive density of held-out data, or else AIC."
     return tables.Table("Fits", tuple(columns), tables.shortened(shown, most), note)
 

@@ -23,9 +23,6 @@ from itertools import islice
 from multiprocessing import current_process
 from typing import Any, NamedTuple
 
-IN_FLIGHT = 4
-"""Tasks that are submitted for each thread of a cluster: more would only take memory of the scheduler."""
-
 TIMEOUT = 60.0
 """Seconds to wait for the first worker."""
 
@@ -97,7 +94,8 @@ def connected(client: Any, processes: int = 1) -> Iterator[Any]:
     if client is None and processes == 1:
         yield None
         return
-    end_repeated_script()
+    if getattr(current_process(), "_inheriting", False):  # a worker that runs its parent's script, which has no guard
+        sys.exit(SCRIPT_REPEATED)
     try:
         from distributed import Client
     except ImportError:
@@ -106,8 +104,22 @@ def connected(client: Any, processes: int = 1) -> Iterator[Any]:
     if isinstance(client, Client) and not client.asynchronous:
         yield client
         return
-    with local_cluster(processes) if client is None else _opened(client) as connection:
+    if client is None:
+        with local_cluster(processes) as connection:
+            yield connection
+        return
+    if not (isinstance(client, str) and "://" in client):
+        wanted = "a distributed.Client, or the address of a scheduler, such as tcp://node1:8786"
+        raise ValueError(f"client is {client!r}; it must be {wanted}")
+    try:
+        connection = Client(client, set_as_default=False)
+    except (OSError, ValueError) as error:
+        raise OSError(f"{client}: there is no scheduler ({one_line(error)})") from None
+    try:
         yield connection
+    finally:
+        with suppress(Exception):
+            connection.close(timeout=1)
 
 
 @contextmanager
@@ -136,32 +148,6 @@ def local_cluster(processes: int) -> Iterator[Any]:
             yield client
     finally:
         logger.setLevel(level)
-
-
-@contextmanager
-def _opened(address: Any) -> Iterator[Any]:
-    """A client of the scheduler at this address."""
-    from distributed import Client
-
-    if not (isinstance(address, str) and "://" in address):
-        wanted = "a distributed.Client, or the address of a scheduler, such as tcp://node1:8786"
-        raise ValueError(f"client is {address!r}; it must be {wanted}")
-    try:
-        client = Client(address, set_as_default=False)
-    except (OSError, ValueError) as error:
-        raise OSError(f"{address}: there is no scheduler ({one_line(error)})") from None
-    try:
-        yield client
-    finally:
-        with suppress(Exception):
-            client.close(timeout=1)
-
-
-def end_repeated_script() -> None:
-    """End a worker process that runs its parent's script, which has no guard, to where that starts workers: to be
-    called before anything that must not be repeated."""
-    if getattr(current_process(), "_inheriting", False):
-        sys.exit(SCRIPT_REPEATED)
 
 
 # ---- threads of this process ----
@@ -213,17 +199,16 @@ def one_line(error: BaseException) -> str:
 def _run_cluster(work: Work, shared: Any, tasks: list[Any], client: Any) -> Iterator[tuple[int, Any]]:
     """A worker takes one task at a time: for several, workers with several threads use a process."""
     import cloudpickle
-    from distributed import KilledWorker, as_completed, wait
+    from distributed import KilledWorker, as_completed
 
     try:
-        payload = cloudpickle.dumps((work, shared))
-        pending = iter([(index, cloudpickle.dumps(task)) for index, task in enumerate(tasks)])
+        payload, pickled = cloudpickle.dumps((work, shared)), [cloudpickle.dumps(task) for task in tasks]
     except Exception as error:  # of any kind, as each class has its own
         raise ValueError(f"what tasks need cannot be pickled for the workers: {one_line(error)}") from None
     if not tasks:
         return
     address, name = str(getattr(client.scheduler, "address", "the cluster")), f"layerjax-{uuid.uuid4().hex[:12]}"
-    running: dict[Any, int] = {}
+    submitted: dict[Any, int] = {}
 
     def require_scheduler() -> None:
         if client.status != "running":
@@ -235,21 +220,14 @@ def _run_cluster(work: Work, shared: Any, tasks: list[Any], client: Any) -> Iter
             warnings.filterwarnings("ignore", message="Sending large graph")
             # a task, not scattered data: it is repeated if the workers that hold it are killed
             sent = client.submit(bytes, payload, key=f"{name}-shared")
-        with client.as_current():
-            wait([sent], timeout=TIMEOUT)
-            client.replicate([sent])  # a scheduler prefers workers that hold the data; those that die get them later
-        completed = as_completed(loop=client.loop)
-
-        def submit() -> None:
-            room = IN_FLIGHT * max(1, sum(client.nthreads().values())) - len(running)
-            for index, task in islice(pending, max(room, 0)):
+            with client.as_current():
+                sent.result(timeout=TIMEOUT)
+                client.replicate([sent])  # a scheduler prefers workers that hold the data
+            for index, task in enumerate(pickled):
                 future = client.submit(perform, sent, name, task, precision(), key=f"{name}-{index}", pure=False)
-                running[future] = index
-                completed.add(future)
-
-        submit()
-        for future in completed:
-            index = running.pop(future)
+                submitted[future] = index
+        for future in as_completed(list(submitted), loop=client.loop):
+            index = submitted.pop(future)
             try:
                 result = future.result()
             except KilledWorker as killed:
@@ -258,7 +236,6 @@ def _run_cluster(work: Work, shared: Any, tasks: list[Any], client: Any) -> Iter
                 require_scheduler()
                 result = Failure("the scheduler has cancelled it")
             future.release()
-            submit()
             yield index, result
     except TimeoutError:
         raise OSError(f"{address}: no worker came within {TIMEOUT:g} s") from None
@@ -267,7 +244,7 @@ def _run_cluster(work: Work, shared: Any, tasks: list[Any], client: Any) -> Iter
         raise  # of the task
     finally:
         with suppress(Exception):  # of a scheduler that has stopped
-            client.cancel(list(running), force=True)
+            client.cancel(list(submitted), force=True)
 
 
 _jobs: dict[str, Any] = {}

@@ -35,7 +35,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from fits._files import locked, require_there
+from fits._files import locked, named, require_there
 
 APPLICATION = 0x6C6A7802
 """SQLite's application_id of a store; its last digits are the version of the layout."""
@@ -173,11 +173,17 @@ class Store:
             return self._connection.execute(statement, values).fetchall()
 
 
-def holds_other_files(directory: Path, store: str) -> bool:
-    """Whether there is no store of this name in a directory, but something that is not of one."""
-    if not directory.is_dir() or (directory / store).is_file():
-        return False
-    return any(not one.name.startswith(store) for one in directory.iterdir())
+def make_directory(directory: Path, store: str) -> Path:
+    """The path of the store of this name in a directory, which is made if it is not there.
+
+    ValueError: there is no such store in it, but something that is not of one. OSError: named.
+    """
+    others = [one for one in directory.iterdir() if not one.name.startswith(store)] if directory.is_dir() else []
+    if others and not (directory / store).is_file():
+        raise ValueError(f"{directory}: is not empty, and holds no {store}: choose another directory")
+    with named(directory):
+        directory.mkdir(parents=True, exist_ok=True)
+    return directory / store
 
 
 def fingerprint(**parts: Any) -> dict[str, str]:

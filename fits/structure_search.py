@@ -14,7 +14,6 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from numbers import Real
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -22,7 +21,6 @@ import numpy as np
 
 import layerjax as lj
 from fits._files import given_path
-from fits._files import named as errors_named
 from fits.data.measurements import TO_HAVE_THEM, Measurements
 from fits.optimise.fit import fit as run_fit
 from fits.optimise.options import DEFAULT, FitOptions
@@ -40,8 +38,8 @@ from fits.progress import Progress, given_progress
 from fits.reports.pages import Table
 from fits.reports.results import load_fit, save_fit
 from fits.reports.verdicts import listed, verdict
-from fits.store import Store, fingerprint, holds_other_files
-from layerjax._checks import in_short, require_count, require_kind, require_seed
+from fits.store import Store, fingerprint, make_directory
+from layerjax._checks import require_count, require_kind, require_number, require_seed
 from layerjax._numerics import broadcasting
 from layerjax.compiling import programs_kept
 
@@ -62,18 +60,16 @@ Checked = tuple[Fit, CrossValidation, Evidence]
 class Library:
     """Layers and bases by name; a base is a surface, or a stack of its own that lets no light pass.
 
-    Raises:
-        ValueError: no layer or base, or a name that would be no name of a file, or that of another part: they are
-            letters, digits, blanks, hyphens and underscores, and differ by more than case, blanks and hyphens.
+    Names are letters, digits, blanks, hyphens and underscores, and differ by more than case, blanks and hyphens.
     """
 
     layers: Mapping[str, lj.Interface | lj.Medium]
     bases: Mapping[str, lj.Stack]
 
     def __post_init__(self) -> None:
-        for kind, parts in (("base", self.bases), ("layer", self.layers)):
-            if not parts:
-                raise ValueError(f"library: it has no {kind}; it must have at least one")
+        for kind in ("bases", "layers"):
+            if not getattr(self, kind):
+                raise ValueError(f"library: it has no {kind}")
         files: dict[str, str] = {}
         for name in (*self.bases, *self.layers):
             if not re.fullmatch(r"\w[\w -]*", name):
@@ -96,9 +92,7 @@ def default_library(channels: int = 1) -> Library:
     require_count("channels", channels, 1)
 
     def coloured(start: float) -> Free:
-        return (
-            Free(start, 0.0, 1.0) if channels == 1 else Free((start,) * channels, (0.0,) * channels, (1.0,) * channels)
-        )
+        return Free(start if channels == 1 else (start,) * channels, 0.0, 1.0)
 
     alpha, thickness = Free(0.3, 0.02, 1.0), Free(0.5, 0.01, 20.0, LogUniform())
     index, extinction = Free(1.5, 0.05, 9.0, LogUniform()), Free(0.5, 0.01, 9.0, LogUniform())
@@ -136,8 +130,7 @@ def read_library(path: str | Path) -> Library:
         except ValueError as error:
             raise ValueError(f"{place}: {error}") from None
 
-    def whole(table: Any) -> Any:
-        """The table of a base as that of a stack."""
+    def whole(table: Any) -> Any:  # of a base as that of a stack
         return table if isinstance(table, dict) and {"layers", "base"} & set(table) else {"base": table}
 
     try:
@@ -178,8 +171,7 @@ class SearchOptions:
         require_count("layers", self.layers, 0, 6)
         for name in ("starts", "beam", "cross_validated"):
             require_count(name, getattr(self, name), 1)
-        if not (isinstance(self.bic_gain, Real) and 0.0 <= float(self.bic_gain) < math.inf):
-            raise ValueError(f"bic_gain is {in_short(self.bic_gain)}; it must be a finite number of at least 0")
+        require_number("bic_gain", self.bic_gain, 0.0)
         require_kind("fit", self.fit, FitOptions)
 
 
@@ -270,12 +262,9 @@ def search(
     Raises:
         ValueError: the directory is in use, or holds another search or something else; as `fit`, `cross_validate`.
     """
-    for name, value, kind in (
-        ("library", library, Library),
-        ("noise", noise, Noise),
-        ("options", options, SearchOptions),
-    ):
-        require_kind(name, value, kind, None)
+    require_kind("library", library, Library, None)
+    require_kind("noise", noise, Noise, None)
+    require_kind("options", options, SearchOptions, None)
     require_kind("data", data, Measurements, fix=TO_HAVE_THEM)
     require_seed(seed)
     library, options = library or default_library(len(data.channels)), options or SearchOptions()
@@ -283,14 +272,12 @@ def search(
     store: Any = nullcontext()
     if directory is not None:
         directory, used = given_path("directory", directory), data.used()
-        if holds_other_files(directory, STORE):
-            raise ValueError(f"{directory}: is not empty, and holds no search")
-        with errors_named(directory):
-            directory.mkdir(parents=True, exist_ok=True)
         # how far it goes is no part of whose search it is: one may go on where another has ended
         starting = {"starts": options.starts, "seed": seed, "fit": options.fit}
         numbers = [used.wi, used.wo, used.values, used.sigma]
-        store = Store.open(directory / STORE, fingerprint(data=numbers, library=library, **settings, **starting))
+        store = Store.open(
+            make_directory(directory, STORE), fingerprint(data=numbers, library=library, **settings, **starting)
+        )
     with store as opened:
         work = _Work(data, library, settings, options, seed, opened, given_progress(progress))
         coarse: dict[Structure, Fit] = {}

@@ -3,7 +3,6 @@
 Inputs are checked, and outputs refused, before any work begins. Numbers go to stdout, progress to stderr.
 """
 
-import os
 import warnings
 from argparse import Namespace
 from collections.abc import Callable
@@ -126,25 +125,19 @@ def report(arguments: Namespace) -> int:
     from fits.reports import results
     from fits.reports.html import FitReport
 
-    directory, out = Path(arguments.directory), arguments.out
-    require_free_place(out, arguments.force)
+    directory = Path(arguments.directory)
+    require_free_place(arguments.out, arguments.force)
     result, posterior = results.load_fit(directory), results.load_posterior(directory)
-    if out is None and not os.access(directory, os.W_OK):
-        raise ValueError(f"{directory}: cannot be written to (--out FILE writes the report elsewhere)")
-    others = _candidates(arguments.compare, arguments.directory)
-    whole = FitReport(result, posterior, others, arguments.directory, results.load_held_out(directory))
-    if out is None:
-        whole.write(directory)
-    else:
-        write_text(out, whole.page(), force=arguments.force)
-    print(f"Report: {out or directory / results.REPORT}")
+    others, held_out = _candidates(arguments.compare), results.load_held_out(directory)
+    out = arguments.out or directory / results.REPORT
+    page = FitReport(result, posterior, others, arguments.directory, held_out).page()
+    write_text(out, page, force=arguments.force or arguments.out is None)
+    print(f"Report: {out}")
     return DONE
 
 
 def compare(arguments: Namespace) -> int:
     """Print which of several saved fits predicts the data best."""
-    if len(arguments.directories) < 2:
-        raise ValueError(f"{arguments.directories[0]} is the only directory given, must be two or more")
     use_jax()
     from fits.prediction.compare import compare as run_compare
     from fits.reports import tables
@@ -152,16 +145,12 @@ def compare(arguments: Namespace) -> int:
     candidates = _candidates(arguments.directories)
     with show_progress() as progress:
         compared = run_compare(candidates, refit=not arguments.no_refit, progress=progress)
-    show(tables.comparison_table(compared), *compared.verdict)
+    show(tables.comparison_table(compared), compared.verdict)
     return DONE
 
 
-def _candidates(directories: list[str], *others: str) -> "dict[str, Fit | Posterior]":
-    """The fits of these directories, or their posteriors, under these words; others: which are not among them."""
-    places = [Path(directory).resolve() for directory in (*directories, *others)]
-    for directory, place in zip(directories, places, strict=False):
-        if places.count(place) > 1:
-            raise ValueError(f"{directory} is given twice")
+def _candidates(directories: list[str]) -> "dict[str, Fit | Posterior]":
+    """The fits of these directories, or their posteriors, under these words."""
     return {directory: _result(Path(directory)) for directory in directories}
 
 
@@ -239,7 +228,7 @@ def info(arguments: Namespace) -> int:
     from fits.reports.tables import Table
 
     out, force = arguments.out or f"{Path(arguments.data).stem}.png", arguments.force
-    require_free_place(arguments.out, force)
+    require_free_place(arguments.out, force, ".png", "pictures")
     data = read_options(arguments).read(arguments.data)
     show(Table(data.source.path, ("", ""), source_rows(data)), data_table(data), *data_statements(data))
     if Path(out).exists() and not force:
@@ -278,14 +267,14 @@ def simulate(arguments: Namespace) -> int:
     """Write simulated measurements of a stack; noise, scale and instrument of its file are not simulated."""
     require_free_place(arguments.out, arguments.force, ".csv", "measurements")
     use_jax()
+    from fits.problem.parameters import at_start
     from fits.problem.simulate import simulate as run_simulation
     from fits.problem.stack_file import read_problem
 
     given = read_problem(arguments.stack)
     geometry = slices([theta for several in arguments.incidence for theta in several], azimuth=arguments.azimuth)
-    data = run_simulation(
-        _at_start(given.stack), geometry, transport=given.transport, noise=arguments.noise, seed=arguments.seed
-    )
+    how = {"transport": given.transport, "noise": arguments.noise, "seed": arguments.seed}
+    data = run_simulation(at_start(given.stack), geometry, **how)
     return _write_measurements(data, arguments)
 
 
@@ -338,6 +327,7 @@ def export(arguments: Namespace) -> int:
 
 def _material(name: str) -> "tuple[Fit | Stack | Mixture, Any]":
     """A saved fit, or a stack of the gallery or of a file, at its start; and its transport, None if not given."""
+    from fits.problem.parameters import at_start
     from fits.problem.stack_file import read_problem
     from fits.reports.results import load_fit
     from layerjax import gallery
@@ -348,17 +338,8 @@ def _material(name: str) -> "tuple[Fit | Stack | Mixture, Any]":
         return gallery.stack(name), None
     if Path(name).suffix == ".toml":
         given = read_problem(name)
-        return _at_start(given.stack), None if given.transport == "auto" else given.transport
+        return at_start(given.stack), None if given.transport == "auto" else given.transport
     raise ValueError(f"{name}: neither a .toml file nor a material of the gallery: {', '.join(gallery.names())}")
-
-
-def _at_start(stack: "Stack | Mixture") -> "Stack | Mixture":
-    """The stack with every free parameter at its start value."""
-    import jax
-
-    from fits.problem.parameters import is_free, with_values
-
-    return with_values(jax.tree.map(lambda leaf: leaf.arrays()[0] if is_free(leaf) else leaf, stack, is_leaf=is_free))
 
 
 COMMANDS: dict[str, Callable[[Namespace], int]] = {

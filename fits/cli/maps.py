@@ -12,28 +12,19 @@ EMULATOR = {"auto": None, "always": True, "never": False}
 
 def fit_map(arguments: Namespace) -> int:
     """Fit a stack to every texel of a map, or resume it, and print what was found."""
-    place = Path(arguments.out).resolve()  # what it holds is for `fits.fit_map` to judge
-    if place.suffix != ".zarr":
+    if Path(arguments.out).suffix != ".zarr":
         raise ValueError(f"{arguments.out}: a fitted map can be written as .zarr only")
-    if place.exists() and not place.is_dir():
-        raise ValueError(f"{arguments.out}: is a file, must be a store or nothing")
-    if not place.parent.is_dir():
-        raise ValueError(f"{arguments.out}: there is no directory {Path(arguments.out).parent}")
-    from fits.maps.inputs import map_data
-    from fits.maps.options import MapOptions, SpatialPrior
-
-    # before anything slow: what is wrong with the files is refused
-    map_data(arguments.data, arguments.geometry, arguments.sigma, arguments.mask)
-    prior = None
     if (arguments.spatial_prior is None) != (arguments.spatial_scale is None):
         raise ValueError("--spatial-prior needs --spatial-scale, such as 0.05, and the scale the prior")
-    if arguments.spatial_prior is not None:
-        prior = SpatialPrior(arguments.spatial_prior, arguments.spatial_scale)
     use_jax()
     from fits.maps import report
     from fits.maps.fit_map import fit_map as run
+    from fits.maps.options import MapOptions, SpatialPrior
     from fits.problem.stack_file import read_problem
 
+    prior = None
+    if arguments.spatial_prior is not None:
+        prior = SpatialPrior(arguments.spatial_prior, arguments.spatial_scale)
     given = read_problem(arguments.stack)
     noise = given.noise if arguments.noise is None else replace(given.noise, relative=arguments.noise)
     kept = f"what was fitted is in {arguments.out}; the same command resumes it"
@@ -61,15 +52,13 @@ def fit_map(arguments: Namespace) -> int:
         )
     found, common = report.summarise(map), report.common_table(map)
     show(report.count_table(found), report.quartile_table(found, map), *([common] if common.rows else []))
-    if prior is not None:
-        show(report.smoothing_words(map))
-    show(*report.noise_words(map), f"Store: {arguments.out}. For the report: layerjax report {arguments.out}")
+    show(*report.verdict(found, map)[0], f"Store: {arguments.out}. For the report: layerjax report {arguments.out}")
     whole = found.done == found.texels and found.fitted > 0
     return DONE if whole and found.converged >= map.option("converged_share") else DOUBTFUL
 
 
 def report_map(arguments: Namespace) -> int:
-    """Write the report of a map, beside its store if no other place is given, and print its numbers."""
+    """Write the report of a map, beside its store if no other place is given, and print its verdict."""
     if arguments.compare:
         raise ValueError(f"--compare: {arguments.directory} is a map, which is not compared with others")
     path = Path(arguments.directory)
@@ -81,8 +70,7 @@ def report_map(arguments: Namespace) -> int:
     map = open_map(arguments.directory)
     with show_progress() as progress:
         found = report.report(map, out, arguments.force, progress)
-    quartiles = [report.quartile_table(found, map)] if found.fitted else []
-    show(report.count_table(found), *quartiles, *report.verdict(found, map)[0], f"Report: {out}")
+    show(*report.verdict(found, map)[0], f"Report: {out}")
     return DONE
 
 

@@ -6,7 +6,7 @@ Values are the BSDF in 1/sr without the cosine. Readers of files convert to it, 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from itertools import compress
-from typing import Any, Self
+from typing import Any, Self, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -231,12 +231,9 @@ def to_bsdf(values: Floats, wo: Floats, quantity: Quantity) -> Floats:
 
 def check_quantity(quantity: str | None) -> Quantity | None:
     """The name of a quantity, or None; anything else is a ValueError."""
-    if quantity is None:
-        return None
-    for known in QUANTITIES:
-        if quantity == known:
-            return known
-    raise ValueError(f"quantity is {quantity!r}, must be one of {', '.join(QUANTITIES)}")
+    if quantity is not None and quantity not in QUANTITIES:
+        raise ValueError(f"quantity is {quantity!r}, must be one of {', '.join(QUANTITIES)}")
+    return cast(Quantity | None, quantity)
 
 
 def channel_names(count: int) -> tuple[str, ...]:

@@ -1,11 +1,9 @@
 """An emulator in the place of a dear transport: Chebyshev series over the bounds of all parameters at once.
 
-What the exact transport says of the data is smooth in every parameter, or in its logarithm where its bounds span a
-large factor. An emulator pays where thousands of texels are fitted with the same directions: a value with its
-derivatives then takes tens of microseconds. Values are kept as logarithms, of which a few directions in the space of
-the data hold all (a singular value decomposition), and each channel has the coordinates of the parameters that matter
-to it alone. Lines through the box say how many terms each series needs, and solutions elsewhere whether they were
-enough.
+It pays where thousands of texels are fitted with the same directions: a value with its derivatives takes tens of
+microseconds. Values are kept as logarithms, of which a few directions in the space of the data hold all (a singular
+value decomposition); each channel has the coordinates of the parameters that matter to it alone. Lines through the box
+say how many terms each series needs, and solutions elsewhere whether they were enough.
 """
 
 import re
@@ -170,7 +168,7 @@ def emulate(problem: Problem, options: MapOptions = DEFAULT) -> tuple[Emulator |
         solves = int(np.prod(terms))
         if solves > options.emulator_max_solves:
             break
-        options.report("emulator", 0, solves, " x ".join(map(str, terms)))
+        options.progress("emulator", 0, solves, " x ".join(map(str, terms)))
         emulator = _make(space, terms, offset, tolerance)
         # the largest error at points that were not solved for it, in standard deviations of the data
         points = 2.0 * qmc.Sobol(len(low), rng=np.random.default_rng(1)).random(CHECKS) - 1.0

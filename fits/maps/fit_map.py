@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 import layerjax as lj
 from fits._files import given_path, locked
 from fits.data.geometry import direction
-from fits.engines import Failure, connected, end_repeated_script, run
-from fits.maps.inputs import Block, MapData, Measured, block_words, map_data
+from fits.engines import Failure, connected, run
+from fits.maps.inputs import Block, MapData, block_words, map_data
 from fits.maps.options import DEFAULT, VERDICTS, MapOptions
 from fits.maps.pilot import Job, fit_pilot, job_of, make_prototype, pilot_texels
 from fits.maps.search import reduced_chi_square, search
@@ -28,7 +28,7 @@ from fits.maps.store import FLAGS, FittedMap, Store, arrays_of, blocks_of, creat
 from fits.maps.texels import standard_errors
 from fits.problem.model import Transport
 from fits.problem.noise import Noise, is_assumed
-from fits.problem.parameters import is_free, with_values
+from fits.problem.parameters import at_start, is_free
 from fits.problem.problem import with_floor
 from fits.store import fingerprint, portable_repr
 from layerjax._checks import require_kind
@@ -76,8 +76,6 @@ def fit_map(
         OSError: of the store, such as a full disk: chunks that are in it stay.
     """
     require_kind("options", options, MapOptions)
-    if options.processes > 1 and client is None:
-        end_repeated_script()
     data = map_data(values, geometry, sigma, mask)
     require_kind("noise", noise, Noise, None)
     if options.instrument is not None and data.geometry is None:
@@ -88,7 +86,7 @@ def fit_map(
     path = given_path("out", out)
     if not path.resolve().parent.is_dir():
         raise ValueError(f"{path}: there is no directory {path.parent}")
-    with locked(Path(f"{path}.lock"), str(path)), connected(client, options.processes) as connection:
+    with connected(client, options.processes) as connection, locked(Path(f"{path}.lock"), str(path)):
         return _fit(path, data, stack, noise, transport, replace(options, chunk_size=size), connection)
 
 
@@ -124,15 +122,14 @@ def _fit(
         store = create(path, about, arrays)
 
     # 3. all chunks
-    is_sent = not data.in_file and client is not None
-    job = job_of(store, problem, data.geometry is None, options, None if is_sent else data)
-    if failures := _fit_chunks(store, job, data, client, options):
+    job = job_of(store, problem, data.geometry is None, options, data)
+    if failures := _fit_chunks(store, job, client, options):
         named = [*failures[:NAMED], *([f"and {len(failures) - NAMED} more"] if len(failures) > NAMED else [])]
         raise ValueError(f"{path}: {'; '.join(named)}; all other chunks are done, and another run does these")
 
     # 4. neighbours held together
     if options.spatial_prior is not None:
-        smooth_map(store, job, data, client, options)
+        smooth_map(store, job, client, options)
     return open_map(path)
 
 
@@ -149,8 +146,7 @@ def _identity(stack: Any, noise: Noise | None, transport: Any, samples: int, opt
     if not isinstance(transport, str | lj.Transport):
         angles = np.linspace(5.0, 75.0, samples)
         wi, wo = direction(angles, 0.0 * angles), direction(angles[::-1], 20.0 * angles)
-        start = jax.tree.map(lambda one: jnp.asarray(one.arrays()[0]) if is_free(one) else one, stack, is_leaf=is_free)
-        parts["transport"] += [np.asarray(jax.jit(transport)(with_values(start), wi, wo), np.float32)]
+        parts["transport"] += [np.asarray(jax.jit(transport)(at_start(stack), wi, wo), np.float32)]
     return fingerprint(**parts, **numbers, precision=precision)
 
 
@@ -169,41 +165,36 @@ def tile(shape: tuple[int, ...], texels: int) -> tuple[int, ...]:
 # ---- chunks, wherever they are done ----
 
 
-def _fit_chunks(store: Store, job: Job, data: MapData, client: Any, options: MapOptions) -> list[str]:
+def _fit_chunks(store: Store, job: Job, client: Any, options: MapOptions) -> list[str]:
     """Fit the chunks that are left; the failures of those that could not be done."""
-    blocks, failures, tasks = store.unfinished(), [], []
-    for block in blocks:
-        try:
-            tasks.append((block, data.read(block) if job.data is None else None))
-        except ValueError as error:
-            failures.append(str(error))
+    blocks, failures = store.unfinished(), []
     total = sum(1 for _ in blocks_of(store.shape, store.chunk))
     done, poor, fitted = total - len(blocks), 0, 0
-    options.report("map", done, total)
-    for index, result in run(work, job, tasks, client=client):
+    options.progress("map", done, total)
+    for index, result in run(work, job, blocks, client=client):
         if isinstance(result, Failure):
-            failures.append(f"chunk {block_words(tasks[index][0])}: {result.error}")
+            failures.append(f"chunk {block_words(blocks[index])}: {result.error}")
         else:
             fitted, poor = fitted + result["fitted"], poor + result["poor"]
         done += 1
-        options.report("map", done, total, f"{100.0 * poor / fitted:.1f} % poor" if fitted else "")
+        options.progress("map", done, total, f"{100.0 * poor / fitted:.1f} % poor" if fitted else "")
     if client is None:  # of a cluster, some may still write what others have done
         store.clean()
     return failures
 
 
-def work(job: Job, task: tuple[Block, Measured | None]) -> dict[str, int]:
+def work(job: Job, block: Block) -> dict[str, int]:
     """Fit a chunk and write it; returns how many texels have which flag."""
-    block, measured = task
-    results = fit_chunk(job, job.measured(block, measured))
+    results = fit_chunk(job, block)
     job.store.write(block, results)
     return {meaning: int(np.sum(results["flags"] & bit > 0)) for meaning, bit in FLAGS.items()}
 
 
-def fit_chunk(job: Job, measured: Measured) -> dict[str, NDArray[Any]]:
+def fit_chunk(job: Job, block: Block) -> dict[str, NDArray[Any]]:
     """The arrays of a store for one chunk, by their names, each of the chunk's shape."""
-    problem, size, shape = job.problem, job.options.chunk_size, measured.mask.shape
-    names, mask, texels = problem.names, measured.mask.reshape(-1), job.texels(measured)
+    mask, texels = job.texels(block)
+    problem, size, shape, mask = job.problem, job.options.chunk_size, mask.shape, mask.reshape(-1)
+    names = problem.names
     results = {name: np.full(texels.number, fill, dtype) for name, (dtype, fill) in arrays_of(names).items()}
     results["measurements"][:] = texels.measurements
     enough = texels.measurements >= len(names)

@@ -1,8 +1,7 @@
 """Measurements of a map: values of every texel, their directions, standard deviations and a mask, read block by block.
 
 A map is an array (..., N, C): texels along the leading axes, N measurements of each, C channels; or (..., N) for one
-channel. It may be far larger than memory. Arrays of numpy, .npy files, HDF5, zarr and xarray all become arrays of
-xarray, whose numbers are read when they are accessed.
+channel. It may be far larger than memory: of arrays of numpy, .npy files, HDF5, zarr and xarray blocks are read.
 """
 
 import math
@@ -13,11 +12,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import h5py
 import numpy as np
 import xarray as xr
+import zarr
 from numpy.typing import NDArray
-from xarray.backends import BackendArray
-from xarray.core import indexing
 
 from fits._files import require_there
 from fits.data.formats.csv import read_directions
@@ -27,8 +26,6 @@ from fits.store import fingerprint
 
 Block = tuple[slice, ...]
 """A selection of the leading axes of a map, the first ones of an array; other axes are taken whole."""
-
-Arrays = dict[str, xr.DataArray]
 
 SAMPLE, CHANNEL = "sample", "channel"
 """Names of the axes of measurements and of channels in xarray."""
@@ -44,30 +41,52 @@ WHOLE, SOME = 2**23, 64
 # ---- arrays, wherever they are ----
 
 
-class _Stored(BackendArray):
-    """Anything that has a shape and takes slices, such as an array of h5py, as xarray reads it."""
+class Array(NamedTuple):
+    """An array that is read in parts.
 
-    def __init__(self, array: Any):
-        self.array, self.shape, self.dtype = array, tuple(array.shape), array.dtype
+    name: as errors call it. source: of numpy, h5py, zarr, or a variable of xarray. by_texel: whether its first axes are
+    those of the map.
+    """
 
-    def __getitem__(self, key: indexing.ExplicitIndexer) -> Any:
-        support = indexing.IndexingSupport.BASIC
-        return indexing.explicit_indexing_adapter(key, self.shape, support, lambda key: np.asarray(self.array[key]))
+    name: str
+    source: Any
+    by_texel: bool = True
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        return tuple(self.source.shape)
+
+    def read(self, block: Block = ()) -> Floats:
+        """A block of it, float64, a copy. ValueError, which names file and block: it cannot be read."""
+        try:
+            return np.array(self.source[(*block, ...) if self.by_texel else ...], dtype=np.float64)
+        except MemoryError:
+            raise
+        except Exception as error:  # codecs raise what they like
+            part = f"block {block_words(block)}" if block else "it"
+            raise ValueError(f"{self.name}: {part} cannot be read: {one_line(error)}") from None
+
+    def checked(self, *shapes: tuple[int, ...], common: tuple[int, ...] = ()) -> "Array":
+        """The array, of one of these shapes, or ValueError; common: that of one which is the same for all texels."""
+        if self.shape not in shapes:
+            allowed = " or ".join(map(str, shapes))
+            raise ValueError(f"{self.name} has shape {self.shape}, must be {allowed} for these values and directions")
+        return self._replace(by_texel=self.shape != common)
 
 
-def _array(source: Any, where: str) -> xr.DataArray:
-    """An array of numpy, h5py, zarr or xarray, or what numpy makes one of, under the name that errors call it."""
-    if isinstance(source, xr.DataArray | xr.Variable):
-        variable = source if isinstance(source, xr.Variable) else source.variable
-    else:
-        array = source if hasattr(source, "dtype") and hasattr(source, "shape") else np.asarray(source)
-        if isinstance(array, np.ma.MaskedArray):
-            array = np.ma.filled(array.astype(np.float64), np.nan)
-        dims = [f"dim_{axis}" for axis in range(len(array.shape))]
-        variable = xr.Variable(dims, indexing.LazilyIndexedArray(_Stored(array)))
-    if variable.dtype.kind not in "biuf":
-        raise ValueError(f"{where} holds {variable.dtype}, must hold real numbers")
-    return xr.DataArray(variable, name=where)
+Arrays = dict[str, Array]
+
+
+def _array(source: Any, name: str) -> Array:
+    """An array of numpy, h5py, zarr or xarray, or what numpy makes one of."""
+    array = source.variable if isinstance(source, xr.DataArray) else source
+    if not (hasattr(array, "dtype") and hasattr(array, "shape")):
+        array = np.asarray(array)
+    if isinstance(array, np.ma.MaskedArray):
+        array = np.ma.filled(array.astype(np.float64), np.nan)
+    if array.dtype.kind not in "biuf":
+        raise ValueError(f"{name} holds {array.dtype}, must hold real numbers")
+    return Array(name, array)
 
 
 def _arrays(source: Any, wanted: str) -> Arrays:
@@ -99,34 +118,28 @@ def _arrays_of_file(source: str, wanted: str) -> Arrays:
             f"{path}: a map is one array, in one of {', '.join(FILES)}; files of measurements are for layerjax fit and "
             "layerjax fit-many"
         )
-    folder, _, last = name.rpartition("/")
     try:
-        root = np.load(path, mmap_mode="r", allow_pickle=False) if suffix == ".npy" else _opened(path, suffix)
+        if suffix == ".npy":
+            root = np.load(path, mmap_mode="r", allow_pickle=False)
+        else:
+            root = zarr.open(path, mode="r") if suffix == ".zarr" else h5py.File(path, "r")
         node = root[name] if name else root
-        is_array = hasattr(node, "dtype")
-        group = folder if is_array else name
-        members = {} if is_array and not name else _group(path, suffix, group)
+        if is_array := hasattr(node, "dtype"):
+            group, _, last = name.rpartition("/")
+        else:
+            group, last = name, ""
+        members = {} if is_array and not name else _group(path, suffix, group, root)
     except KeyError:
         raise ValueError(f"{path}: holds no {name!r}") from None
     except Exception as error:  # codecs raise what they like
         raise ValueError(f"{path}: cannot be read: {one_line(error)}") from None
     arrays = _numbers(members, f"{path}:/{group}".rstrip("/"))
     if is_array:
-        arrays[wanted] = arrays[last] if last in arrays else _array(node, source)
+        arrays[wanted] = arrays.get(last) or _array(node, source)
     return arrays
 
 
-def _opened(path: str, suffix: str) -> Any:
-    if suffix == ".zarr":
-        import zarr
-
-        return zarr.open(path, mode="r")
-    import h5py
-
-    return h5py.File(path, "r")
-
-
-def _group(path: str, suffix: str, name: str) -> Mapping[Any, Any]:
+def _group(path: str, suffix: str, name: str, root: Any) -> Mapping[Any, Any]:
     """The arrays of a group as xarray reads them: with factor, offset and the number that stands for nothing."""
     options: dict[str, Any] = {"group": name or None, "decode_times": False}
     if suffix != ".zarr":
@@ -134,44 +147,16 @@ def _group(path: str, suffix: str, name: str) -> Mapping[Any, Any]:
     try:
         return xr.open_zarr(path, consolidated=False, chunks=None, **options).variables
     except (KeyError, ValueError):  # axes without names
-        root = _opened(path, suffix)
         return dict((root[name] if name else root).arrays())
 
 
-def _choose(source: Any, wanted: str, arrays: Arrays) -> xr.DataArray:
+def _choose(source: Any, wanted: str, arrays: Arrays) -> Array:
     """The array of the wanted name, or the only one."""
     if wanted not in arrays and len(arrays) != 1:
         where = source if isinstance(source, str | os.PathLike) else wanted
         names = f"there are {', '.join(sorted(arrays)[:9])}" if arrays else "there is none"
         raise ValueError(f"{where}: no array {wanted!r} of numbers, {names}; PATH:/NAME chooses another")
     return arrays[wanted] if wanted in arrays else next(iter(arrays.values()))
-
-
-def _read(array: xr.DataArray, block: Block = ()) -> Floats:
-    """A block of it, float64, a copy, along the axes of texels that it has. ValueError, which names file and block: it
-    cannot be read."""
-    parts = {name: part for name, part in zip(_texel_axes(len(block)), block, strict=True) if name in array.dims}
-    try:
-        return np.array(array.variable.isel(parts).values, dtype=np.float64)
-    except MemoryError:
-        raise
-    except Exception as error:  # codecs raise what they like
-        part = f"block {block_words(block)}" if block else "it"
-        raise ValueError(f"{array.name}: {part} cannot be read: {one_line(error)}") from None
-
-
-def _texel_axes(rank: int) -> tuple[str, ...]:
-    """Names of the axes of a map."""
-    return tuple(f"axis_{axis}" for axis in range(rank))
-
-
-def _with_axes(array: xr.DataArray, sizes: Mapping[str, int], *choices: tuple[str, ...]) -> xr.DataArray:
-    """The array with the names of its axes, by its shape; ValueError if that is none of these."""
-    shapes = {tuple(sizes[name] for name in names): names for names in choices}
-    if array.shape not in shapes:
-        allowed = " or ".join(map(str, shapes))
-        raise ValueError(f"{array.name} has shape {array.shape}, must be {allowed} for these values and directions")
-    return array.rename(dict(zip(array.dims, shapes[array.shape], strict=True)))
 
 
 # ---- the measurements of a map ----
@@ -193,16 +178,16 @@ class Measured(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class MapData:
-    """The measurements of a map, opened and not loaded; axes of the arrays are named.
+    """The measurements of a map, opened and not loaded.
 
     directions: by name, of `VECTORS` or `ANGLES`. shape: of the map. samples: N. channels: C. geometry: the directions,
     if all texels have the same. arguments: of `map_data`.
     """
 
-    values: xr.DataArray
+    values: Array
     directions: Arrays
-    sigma: xr.DataArray | None
-    mask: xr.DataArray | None
+    sigma: Array | None
+    mask: Array | None
     shape: tuple[int, ...]
     samples: int
     channels: int
@@ -215,11 +200,6 @@ class MapData:
         sigma = None if self.sigma is None else sigma  # a noise model need not have it
         arguments = (values, geometry, sigma, mask)
         return map_data, tuple(os.path.abspath(one) if isinstance(one, str | os.PathLike) else one for one in arguments)
-
-    @property
-    def in_file(self) -> bool:
-        """Whether another process can read the values by itself."""
-        return isinstance(self.arguments[0], str | os.PathLike)
 
     def read(self, block: Block = ()) -> Measured:
         """The measurements of a block; what stands in masked texels is not looked at.
@@ -238,7 +218,7 @@ class MapData:
                 )
             sigma = np.where(sigma > 0.0, sigma, np.nan)
         if self.geometry is None:
-            directions = {name: _read(one, block) for name, one in self.directions.items()}
+            directions = {name: one.read(block) for name, one in self.directions.items()}
             wi, wo = _unit_vectors(directions, mask, f" in block {block_words(block)}")
         return Measured(self._expanded(self.values, block), sigma, mask, wi, wo)
 
@@ -246,13 +226,14 @@ class MapData:
         """Which texels of a block take part: all if there is no mask."""
         if self.mask is None:
             return np.ones([one.stop - one.start for one in block], bool)
-        return _read(self.mask, block) != 0.0
+        return self.mask.read(block) != 0.0
 
-    def _expanded(self, array: xr.DataArray, block: Block) -> Floats:
+    def _expanded(self, array: Array, block: Block) -> Floats:
         """A block of values or their deviations at its full shape, (block shape, N, C)."""
-        sizes = {name: one.stop - one.start for name, one in zip(_texel_axes(len(block)), block, strict=True)}
-        variable = xr.Variable(array.dims, _read(array, block))
-        return np.array(variable.set_dims({**sizes, SAMPLE: self.samples, CHANNEL: self.channels}).values)
+        part = array.read(block)
+        if part.ndim in (1, len(block) + 1):  # the same for all channels
+            part = part[..., None]
+        return np.broadcast_to(part, (*(one.stop - one.start for one in block), self.samples, self.channels)).copy()
 
     def fingerprint(self) -> str:
         """What distinguishes these measurements from others: of shape and directions, and of all numbers up to 64 MiB,
@@ -289,39 +270,36 @@ def map_data(values: Any, geometry: Any = None, sigma: Any = None, mask: Any = N
     array = _choose(values, "values", arrays)
     if 0 in array.shape:
         raise ValueError(f"{array.name} has shape {array.shape}, must hold something along every axis")
-    array = array.transpose(..., *(name for name in (SAMPLE, CHANNEL) if name in array.dims))
+    names = getattr(array.source, "dims", ())
+    if named := [name for name in (SAMPLE, CHANNEL) if name in names]:
+        array = array._replace(source=array.source.transpose(..., *named))
     directions = _directions(geometry, arrays)
-    components = ("xyz",) if "wi" in directions else ()
+    components = (3,) if "wi" in directions else ()
     samples = next(iter(directions.values())).shape[-1 - len(components)]
 
     # the last axes are those of measurements and channels, or of measurements
-    if array.ndim > 2 and array.shape[-2] == samples and array.dims[-1] != SAMPLE:
+    if len(array.shape) > 2 and array.shape[-2] == samples and named[-1:] != [SAMPLE]:
         shape, channels = array.shape[:-2], array.shape[-1]
-    elif array.ndim > 1 and array.shape[-1] == samples:
+    elif len(array.shape) > 1 and array.shape[-1] == samples:
         shape, channels = array.shape[:-1], 1
     else:
         raise ValueError(
             f"{array.name} has shape {array.shape}, the geometry {samples} pairs of directions: values must be "
             f"(..., {samples}, C), or (..., {samples}) for one channel, with an axis or more of texels"
         )
-    texels = _texel_axes(len(shape))
-    sizes = dict(zip(texels, shape, strict=True)) | {SAMPLE: samples, CHANNEL: channels, "xyz": 3}
-    each, common = (*texels, SAMPLE, *components), (SAMPLE, *components)
-    directions = {name: _with_axes(one, sizes, common, each) for name, one in directions.items()}
-
-    def other(source: Any, wanted: str, *choices: tuple[str, ...]) -> xr.DataArray | None:
-        if source is None:
-            return None
-        return _with_axes(_choose(source, wanted, _arrays(source, wanted)), sizes, *choices)
-
-    deviations = other(sigma, "sigma", (*texels, SAMPLE, CHANNEL), (*texels, SAMPLE), (SAMPLE,))
-    part = other(mask, "mask", texels)
-    if part is not None and part.dtype.kind == "f":
-        raise ValueError(f"{part.name} holds {part.dtype}, a mask must hold truth values or whole numbers")
-    array = _with_axes(array, sizes, (*texels, SAMPLE, CHANNEL), (*texels, SAMPLE))
+    common = (samples, *components)
+    directions = {name: one.checked(common, (*shape, *common), common=common) for name, one in directions.items()}
+    deviations = part = None
+    if sigma is not None:
+        shapes = (*shape, samples, channels), (*shape, samples), (samples,)
+        deviations = _choose(sigma, "sigma", _arrays(sigma, "sigma")).checked(*shapes, common=(samples,))
+    if mask is not None:
+        part = _choose(mask, "mask", _arrays(mask, "mask")).checked(shape)
+        if part.source.dtype.kind == "f":
+            raise ValueError(f"{part.name} holds {part.source.dtype}, a mask must hold truth values or whole numbers")
     view = None
-    if all(one.dims == common for one in directions.values()):
-        vectors = {name: _read(one) for name, one in directions.items()}
+    if not any(one.by_texel for one in directions.values()):
+        vectors = {name: one.read() for name, one in directions.items()}
         view = Geometry(*_unit_vectors(vectors, np.ones((), bool), ""))
     data = MapData(array, directions, deviations, part, shape, samples, channels, view, (values, geometry, sigma, mask))
     if view is None and not isinstance(geometry, str | os.PathLike | None):  # what is wrong in memory is refused now
@@ -331,7 +309,7 @@ def map_data(values: Any, geometry: Any = None, sigma: Any = None, mask: Any = N
 
 def _directions(geometry: Any, arrays: Arrays) -> Arrays:
     """The arrays of directions by name; arrays: those beside the values."""
-    where = "geometry is not given, and there is nothing beside the values that"
+    missing = "geometry (--geometry) is not given, and there are no directions beside the values"
     if geometry is not None:
         if isinstance(geometry, str | Path) and Path(geometry).is_file() and Path(geometry).suffix.lower() not in FILES:
             geometry = read_directions(Path(geometry))
@@ -341,14 +319,14 @@ def _directions(geometry: Any, arrays: Arrays) -> Arrays:
             if len(geometry) != 2:
                 raise ValueError(f"geometry has {len(geometry)} entries, must be two: wi and wo")
             geometry = dict(zip(VECTORS, geometry, strict=True))
-        where, arrays = "geometry", _arrays(geometry, "geometry")
+        missing, arrays = "geometry holds no directions", _arrays(geometry, "geometry")
     names = next((names for names in (VECTORS, ANGLES) if all(name in arrays for name in names)), None)
     if names is None:
         wanted = f"{' and '.join(VECTORS)}, or {', '.join(ANGLES)} in degrees"
-        raise ValueError(f"{where} has no directions, must hold {wanted}")
+        raise ValueError(f"{missing}: {wanted}")
     for name in names:
         least = 2 if names is VECTORS else 1
-        if arrays[name].ndim < least or 0 in arrays[name].shape:
+        if len(arrays[name].shape) < least or 0 in arrays[name].shape:
             raise ValueError(f"{arrays[name].name} ({name}) has shape {arrays[name].shape}, must be (N, 3) or (N,)")
     return {name: arrays[name] for name in names}
 

@@ -9,7 +9,7 @@ from fits._files import require_switch
 from fits.names import Objective
 from fits.problem.instrument import Instrument
 from fits.problem.parameters import Free
-from fits.progress import Progress
+from fits.progress import Progress, given_progress, silent
 from layerjax._checks import require_choice, require_count, require_kind, require_number
 
 Kind = Literal["gaussian", "total_variation"]
@@ -118,8 +118,8 @@ class MapOptions:
     """1: threads of this process, one a core; more: so many processes with one thread each."""
     force: bool = False
     """Throw away a store of other arguments, and begin anew."""
-    progress: Progress | None = None
-    """Called with (stage, done, all, note): "pilot", "map" and so on."""
+    progress: Progress = silent
+    """Called with (stage, done, all, note): "pilot", "map" and so on; None: not."""
 
     def __post_init__(self) -> None:
         for name, least in {"starts": 1, "seed": 0, "pilot_texels": 1, "chunk_size": 1, "restarts": 0, "processes": 1,
@@ -132,6 +132,7 @@ class MapOptions:
         require_switch("emulator", self.emulator, None)
         require_switch("force", self.force)
         require_kind("spatial_prior", self.spatial_prior, SpatialPrior, None)
+        object.__setattr__(self, "progress", given_progress(self.progress))
 
     @property
     def model(self) -> dict[str, Any]:
@@ -142,11 +143,6 @@ class MapOptions:
         """Those that a store keeps: all but the model, the spatial prior and who does the work."""
         without = {*self.model, "spatial_prior", "processes", "force", "progress"}
         return {one.name: getattr(self, one.name) for one in fields(self) if one.name not in without}
-
-    def report(self, stage: str, done: int, total: int, note: str = "") -> None:
-        """Report progress, where somebody listens."""
-        if self.progress is not None:
-            self.progress(stage, done, total, note)
 
 
 DEFAULT = MapOptions()

@@ -31,6 +31,7 @@ from fits.problem.noise import DEFAULT_FLOOR, DEFAULT_RELATIVE, Noise
 from fits.problem.parameters import Free, is_free
 from fits.problem.problem import Problem
 from fits.problem.stack_file import transport_from_dict, transport_to_dict
+from fits.progress import silent
 
 Floats = NDArray[np.float64]
 
@@ -50,7 +51,7 @@ class Job:
         emulator: in the place of its transport; None: that itself.
         starts: of all fits but those of the pilot.
         options: of the map; its chunk size is that of the program.
-        data: the measurements; None where each task brings its own.
+        data: the measurements.
     """
 
     path: str
@@ -58,7 +59,7 @@ class Job:
     emulator: Emulator | None
     starts: Starts
     options: MapOptions
-    data: MapData | None
+    data: MapData
 
     def __getstate__(self) -> dict[str, Any]:  # a model and an open store do not outlive their process
         return {one.name: getattr(self, one.name) for one in fields(self)}
@@ -73,16 +74,10 @@ class Job:
         """The store, opened once in each process."""
         return Store(self.path)
 
-    def texels(self, measured: Measured) -> Texels:
-        """Those of a block, one after the other."""
-        return texels_of(measured, least_floor(self.prototype))
-
-    def measured(self, block: Block, measured: Measured | None) -> Measured:
-        """The measurements of a block; measured: as the task brings them."""
-        if measured is not None:
-            return measured
-        assert self.data is not None
-        return self.data.read(block)
+    def texels(self, block: Block) -> tuple[NDArray[np.bool_], Texels]:
+        """Which texels of a block take part, (block shape), and those of the block, one after the other."""
+        measured = self.data.read(block)
+        return measured.mask, texels_of(measured, least_floor(self.prototype))
 
 
 def map_problem(problem: Problem, own_directions: bool, emulator: Emulator | None) -> Problem:
@@ -200,12 +195,12 @@ def fit_pilot(
 
     common: dict[str, Any] = {}
     if problem.common_names:
-        options.report("common", 0, len(problem.common_names))
+        options.progress("common", 0, len(problem.common_names))
         common = fit_common(map_problem(problem, own_directions, None), texels, options)
         problem = with_common(problem, {name: one["value"] for name, one in common.items()})
 
     # the pilot, at finer resolutions until its noise hides their error
-    options.report("pilot", 0, texels.number)
+    options.progress("pilot", 0, texels.number)
     if own_directions and options.emulator:
         raise ValueError("emulator: there is none where every texel has directions of its own")
     pays = known is not None and np.prod(shape) >= options.emulator_min_texels
@@ -232,7 +227,7 @@ def fit_pilot(
             numerical["resolution"] = resolution_in_words(problem, known)
             break
         problem = fine
-    options.report("pilot", texels.number, texels.number)
+    options.progress("pilot", texels.number, texels.number)
 
     reduced = reduced_chi_square(results.fits, texels)
     finite = reduced[np.isfinite(reduced)]
@@ -249,7 +244,7 @@ def fit_pilot(
     return arrays, about | {"numerical": numerical | {"error": error}}
 
 
-def job_of(store: Store, problem: Problem, own_directions: bool, options: MapOptions, data: MapData | None) -> Job:
+def job_of(store: Store, problem: Problem, own_directions: bool, options: MapOptions, data: MapData) -> Job:
     """The work of a map by what a store keeps of its pilot, see `fit_pilot`; problem: as that was called with."""
     kept, group = store.attributes["pilot"], store.load_group(PILOT)
     assert group is not None
@@ -265,7 +260,7 @@ def job_of(store: Store, problem: Problem, own_directions: bool, options: MapOpt
     emulator = Emulator.of(arrays) if "orders" in arrays else None
     ready, size = map_problem(problem, own_directions, emulator), options.chunk_size
     starts = starts_at(ready, arrays["starts"], own_directions, size, kept["poor_above"])
-    return Job(str(store.path.resolve()), problem, emulator, starts, replace(options, progress=None), data)
+    return Job(str(store.path.resolve()), problem, emulator, starts, replace(options, progress=silent), data)
 
 
 def _numerical_error(ready: Problem, fine: Problem, results: Results, texels: Texels) -> float:

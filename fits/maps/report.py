@@ -5,7 +5,6 @@ of one axis as an image of one row; of more axes the slice in the middle of the 
 """
 
 import html
-import json
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,30 +18,14 @@ from matplotlib.patches import Patch
 from scipy.stats import chi2
 
 from fits._files import write_text
+from fits.maps.options import MapOptions
 from fits.maps.store import FLAGS, FittedMap, Floats
-from fits.problem.noise import DEFAULT_RELATIVE
 from fits.progress import Progress, silent
 from fits.reports.pages import Table, document, html_table, image, made_with, section
 from fits.reports.pages import verdict as verdict_box
 from fits.reports.plots.data import GREY, LOG_ABOVE, STYLE, as_png
 from fits.reports.tables import with_error
-from fits.reports.verdicts import listed
-
-WORDS = {
-    "fitted": "fitted",
-    "converged": "converged",
-    "at_bound": "at a bound",
-    "poor": "poor: chi-square above what noise and the pilot explain",
-    "restarted": "fitted again from other starts",
-    "masked": "masked",
-    "too_few_measurements": "too few measurements",
-    "failed": "failed: no finite value",
-    "unidentified": "a parameter is unidentified",
-}
-"""The meaning of each flag."""
-
-MADE = ("version", "shape", "chunk", "samples", "channels", "transport", "noise", "options", "pilot", "numerical")
-"""Attributes of a store that a report shows as they are."""
+from fits.reports.verdicts import NOISE_ASSUMED, listed
 
 INNER = (1.0, 99.0)  # percentiles between which colours run
 WIDTH = 4.8  # inches
@@ -101,35 +84,27 @@ def summarise(map: FittedMap) -> Summary:
 # ---- in sentences ----
 
 
-def noise_words(map: FittedMap) -> list[str]:
-    """That a noise was assumed, where nothing says how large it is."""
-    if not map.attributes.get("noise_assumed"):
-        return []
-    level = f"{100.0 * DEFAULT_RELATIVE:g} %"
-    return [f"No noise is stated: {level} of the model's value is assumed. State it as `relative`, or by `--noise`."]
-
-
 def verdict(summary: Summary, map: FittedMap) -> tuple[list[str], bool]:
     """How far the map can be relied on, in a few sentences, and whether they are without reservation."""
-    counts, fitted, option = summary.counts, summary.fitted, map.option
+    counts, fitted, option, about = summary.counts, summary.fitted, map.option, map.attributes
 
     # how much of the map there is, and why the rest is not
     reasons = {"masked": "masked", "too_few_measurements": "with too few measurements", "failed": "failed"}
     rest = [f"{counts[flag]:,} {words}" for flag, words in reasons.items() if counts[flag]]
-    parts, sound = ", ".join([f"{fitted:,} are fitted", *rest]), summary.done == summary.texels
-    words = [f"A map of {summary.texels:,} texels: {parts}."]
-    if not sound:
+    words = [f"A map of {summary.texels:,} texels: {', '.join([f'{fitted:,} are fitted', *rest])}."]
+    if not (finished := summary.done == summary.texels):
         done = f"{summary.done:,} of {summary.texels:,} texels ({share(summary.done, summary.texels)}) are done"
-        words = [f"The map is not finished: {done}, and the same command resumes it.", f"Of these, {parts}."]
+        words.append(f"The map is not finished: {done}, and the same command resumes it.")
     if not fitted:
         return [*words, "No texel is fitted."], False
-    sound &= counts["converged"] >= option("converged_share") * (fitted + counts["failed"])
     words.append(f"{share(counts['converged'], fitted)} of the fitted texels converged.")
+    converged = counts["converged"] >= option("converged_share") * (fitted + counts["failed"])
 
     # chi-square beside what noise makes of it
-    words += (assumed := noise_words(map))
+    assumed = about.get("noise_assumed", False)
+    words += [NOISE_ASSUMED] if assumed else []
     low, median, high = summary.quartiles["reduced_chi_square"]
-    own = [name for name in map.names if name not in map.attributes["common"]]
+    own = [name for name in map.names if name not in about["common"]]
     freedom = summary.quartiles["measurements"][1] - len(own)
     spread = math.sqrt(2.0 / freedom) if freedom > 0 else math.inf
     far = option("chi_square_sigmas") * spread
@@ -138,72 +113,57 @@ def verdict(summary: Summary, map: FittedMap) -> tuple[list[str], bool]:
             f"Chi-square per degree of freedom is {median:.3g} in the median texel, and between {low:.3g} and "
             f"{high:.3g} in half of them; the right model with the right noise gives 1 ± {spread:.2g}."
         )
-        if median > 1.0 + far:
-            words.append("The model does not explain the data to within their noise: the errors are too small.")
-        if median < 1.0 - far:
-            stated = "assumed" if assumed else "stated"
-            words.append(f"The data scatter less than the {stated} noise: the errors are too large.")
     else:
         words.append("No texel has a chi-square: there are no more measurements than parameters.")
+    if median > 1.0 + far:
+        words.append("The model does not explain the data to within their noise: the errors are too small.")
+    if median < 1.0 - far:
+        words.append(
+            f"The data scatter less than the {'assumed' if assumed else 'stated'} noise: errors are too large."
+        )
     explained = abs(median - 1.0) <= far  # not so for NaN
 
-    # flags; where noise does not explain the pilot, by which texels are flagged, none is said to be good
-    most = sorted(((count, name) for name, count in summary.at_bound.items() if count), reverse=True)[:3]
-    which = f" ({', '.join(f'{name} in {share(count, fitted)}' for count, name in most)})" if most else ""
-    bounded = f"At a bound: {share(counts['at_bound'], fitted)} of the fitted texels{which}."
-    words.append(bounded if counts["at_bound"] else "No texel is at a bound.")
-    most_of_noise = float(chi2.isf(option("poor_probability"), max(freedom, 1.0))) / max(freedom, 1.0)
-    limit = map.attributes["pilot"]["poor_above"]
-    pilot_is_explained = limit <= option("pilot_factor") * most_of_noise
-    if counts["poor"]:
-        poor = share(counts["poor"], fitted)
-        words.append(
-            f"Poor: {poor} of the fitted texels: chi-square is above {limit:.3g}, more than noise and pilot explain."
-        )
-    elif math.isfinite(median):
-        known = pilot_is_explained and median <= 1.0 + far
-        above = "what noise and the pilot explain" if known else f"{limit:.3g}, more than in the pilot"
-        words.append(f"No converged texel {'is poor' if known else 'stands out'}: chi-square is nowhere above {above}.")
-    if counts["unidentified"]:
-        unidentified = share(counts["unidentified"], fitted)
-        words.append(f"In {unidentified} of the fitted texels the data leave a parameter unidentified.")
-    flagged = max(counts[flag] for flag in ("at_bound", "poor", "unidentified"))
-    sound &= explained and pilot_is_explained and flagged <= option("flagged_share") * fitted
-    about_pilot, pilot_is_sound = _of_pilot(map)
-    return words + about_pilot, sound and pilot_is_sound
+    # flags; where noise does not explain the pilot, by which texels are flagged, few are
+    limit, freedom = about["pilot"]["poor_above"], max(freedom, 1.0)
+    explained &= limit <= option("pilot_factor") * float(chi2.isf(option("poor_probability"), freedom)) / freedom
+    flags = {
+        "at_bound": "are at a bound",
+        "poor": f"are poor: chi-square is above {limit:.3g}, more than noise and the pilot explain",
+        "unidentified": "have a parameter that the data leave unidentified",
+    }
+    words += [
+        f"{share(counts[flag], fitted)} of the fitted texels {what}." for flag, what in flags.items() if counts[flag]
+    ]
+    few_flagged = max(counts[flag] for flag in flags) <= option("flagged_share") * fitted
 
-
-def _of_pilot(map: FittedMap) -> tuple[list[str], bool]:
-    """Sentences on common parameters and the numerical error, and whether they are without reservation."""
-    common, words, sound = map.attributes["common"], [], True
-    if not all(one["converged"] for one in common.values()):
+    # what all texels have from the pilot
+    joint = all(one["converged"] for one in about["common"].values())
+    if not joint:
         words.append("The joint fit of common parameters has not converged: all else is fitted with wrong values.")
-        sound = False
-    if unknown := [name for name, one in common.items() if math.isinf(float(one["error"]))]:
+    if unknown := [name for name, one in about["common"].items() if math.isinf(float(one["error"]))]:
         words.append(f"The pilot leaves {listed(unknown)}, common to all texels, unidentified.")
-        sound = False
-    if (error := map.numerical_error) is not None:
-        small = error <= map.option("numerical_error")
-        but = "" if small else ": a finer resolution may give other values"
+    error = map.numerical_error or 0.0
+    accurate = error <= option("numerical_error")
+    if map.numerical_error is not None:
+        but = "" if accurate else ": a finer resolution may give other values"
         words.append(f"The numerical error of the model is at most {error:.2g} standard deviations in the pilot{but}.")
-        sound &= small
-    return words, sound
+    words += smoothing_words(map)
+    return words, finished and converged and explained and few_flagged and joint and not unknown and accurate
 
 
-def smoothing_words(map: FittedMap) -> str:
-    """How a map was smoothed, and whether that has settled, in a few sentences; nothing if it was not."""
+def smoothing_words(map: FittedMap) -> list[str]:
+    """How a map was smoothed, and whether that has settled, in a few sentences; none if it was not."""
     about = map.smoothing
     if about is None:
-        return ""
+        return []
     scales, settled = about["prior"]["scale"], "" if about["settled"] else ": it has not settled"
-    one_scale = len(set(scales.values())) == 1 and scales.keys() == set(map.names)
-    each = f"{scales[map.names[0]]:g}" if one_scale else ", ".join(f"{name} {one:g}" for name, one in scales.items())
-    return (
+    each = ", ".join(f"{name} {one:g}" for name, one in scales.items())
+    return [
         f"Smoothed beside the plain fit by block alternation ({about['prior']['kind'].replace('_', ' ')}, of the "
         f"bounds: {each}), in {about['rounds']} rounds; in the last one texels moved by at most "
-        f"{about['largest_moves'][-1]:.2g} standard errors{settled}. "
-        "Errors of the smoothed map are conditional on the values of the neighbours."
-    )
+        f"{about['largest_moves'][-1]:.2g} standard errors{settled}.",
+        "Errors of the smoothed map are conditional on the values of the neighbours.",
+    ]
 
 
 def share(part: float, whole: float) -> str:
@@ -224,7 +184,7 @@ def count_table(summary: Summary) -> Table:
         if count or flag == "fitted":
             of_map = flag in ("fitted", "masked", "too_few_measurements", "failed")
             percent = share(count, summary.texels) if of_map else f"{share(count, summary.fitted)} of the fitted"
-            rows.append((WORDS[flag], count, percent))
+            rows.append((flag.replace("_", " "), count, percent))
     for name, count in summary.at_bound.items():
         if count:
             rows.append((f"at a bound: {name}", count, f"{share(count, summary.fitted)} of the fitted"))
@@ -251,6 +211,24 @@ def common_table(map: FittedMap) -> Table:
     return Table("Common to all texels", ("parameter", "value", "error", "unit"), tuple(rows))
 
 
+def made_table(map: FittedMap) -> Table:
+    """How the map was made: the model but for the stack, the pilot, and options that are not the usual ones."""
+    about, pilot = map.attributes, map.attributes["pilot"]
+    limit = pilot["poor_above"]
+    options = (f"{name} {value}" for name, value in about["options"].items() if value != getattr(MapOptions, name))
+    rows = {
+        "store": map.path,
+        "transport": about["transport"],
+        **about["numerical"],
+        "noise": about["noise"],
+        "data": f"{about['samples']} measurements a texel, of {', '.join(about['channels'])}",
+        "median of the pilot": f"chi2/dof {pilot['reduced_chi_square'] or math.nan:.3g}; poor above {limit:.3g}",
+        "options": ", ".join(options) or "default",
+        "fitted by": f"layerjax {about['version']}",
+    }
+    return Table("", ("", ""), tuple((name, str(value)) for name, value in rows.items() if value is not None))
+
+
 # ---- as a page ----
 
 
@@ -272,10 +250,8 @@ def report(map: FittedMap, path: str | Path, force: bool = True, progress: Progr
     flags = _figures(map, ("The gravest flag of each texel.", flag_picture(map.flags)))
     body.append(section("Texels", flags, count_table(numbers)))
     if numbers.fitted:
-        common = common_table(map)
-        body.append(section("Values in short", quartile_table(numbers, map), common if common.rows else None))
+        body.append(section("Values in short", quartile_table(numbers, map), common_table(map)))
         parts = ['<p class="note">Colours run over the middle 98 % of the values.</p>']
-        parts.append(f"<p>{html.escape(smoothing_words(map))}</p>")
         for number, name in enumerate(map.names):
             progress("pictures", number, len(map.names), name)
             unit, norm = "unitless" if map.units[name] == "1" else map.units[name], inner_norm(map.values[name])
@@ -292,9 +268,8 @@ def report(map: FittedMap, path: str | Path, force: bool = True, progress: Progr
         chi_square = value_picture(ratio, words, "χ² / degree of freedom", "viridis", inner_norm(ratio))
         fit = _figures(map, (f"{words.capitalize()}; 1: as the noise makes it.", chi_square))
         body += [section("Values and errors", *parts), section("Goodness of fit", fit)]
-    made = {name: map.attributes[name] for name in MADE if name in map.attributes}
-    texts = (str(map.path), json.dumps(made, indent=1), str(map.attributes.get("stack", "")))
-    body += [section("How it was made", *(f"<pre>{html.escape(text)}</pre>" for text in texts)), made_with()]
+    stack = f"<pre>{html.escape(str(map.attributes['stack']))}</pre>"
+    body += [section("How it was made", made_table(map), stack), made_with()]
     write_text(path, document(title, body), force=force)
     return numbers
 

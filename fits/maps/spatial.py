@@ -1,15 +1,12 @@
 """A spatial prior: neighbouring texels held together, by block alternation beside the plain fit and after it.
 
-Texels are coloured like a chessboard, so that no edge joins two of one colour. With the other colour held, the
-posterior of the whole map falls apart into texels: each has its measurements, its prior, and a Gaussian that draws it
-to its neighbours. Every half round lowers minus the log-posterior of the map, or leaves it where it is; its limit is a
-minimum, though not of all minima the lowest. A texel moves no farther in a round than its neighbours allow: where the
-spatial prior weighs much more than the data, many rounds are needed.
+Texels are coloured like a chessboard, so that no edge joins two of one colour. With the other colour held, each texel
+has a posterior of its own: its measurements, its prior, and a Gaussian that draws it to its neighbours. Every half
+round lowers minus the log-posterior of the map, or leaves it where it is. Where the spatial prior weighs much more than
+the data, many rounds are needed. Edges join fitted texels that lie side by side along an axis of the map.
 
-All is said in the coordinate of the fit, the unit box: 0 and 1 are the bounds of a parameter, between which it runs in
-the value, or in its logarithm for the priors `LogUniform` and `LogNormal`. Edges lead from each texel to those beside
-it along the axes of the map, and join fitted texels alone. After each round the state is kept in the store as the group
-``smoothed``, from which an interrupted run resumes.
+Differences are in the unit box, between the bounds of a parameter or of its logarithm (`LogUniform`, `LogNormal`). The
+state after each round is the group ``smoothed`` of the store, from which an interrupted run resumes.
 """
 
 import json
@@ -22,7 +19,7 @@ from numpy.typing import NDArray
 
 from fits._files import plain
 from fits.engines import Failure, run
-from fits.maps.inputs import Block, MapData, Measured, block_words
+from fits.maps.inputs import Block, block_words
 from fits.maps.options import Kind, MapOptions
 from fits.maps.pilot import Job
 from fits.maps.store import FLAGS, SMOOTHED, Store, blocks_of
@@ -63,7 +60,7 @@ class Half(NamedTuple):
     """The texels of one colour in a chunk.
 
     places: of M texels in the block, counted along its axes. units: where they are, (M, P), in the unit box. centre,
-    inverse_sd: how strongly their neighbours hold them, see `Texels`. measured: None where workers read it themselves.
+    inverse_sd: how strongly their neighbours hold them, see `Texels`.
     """
 
     block: Block
@@ -71,20 +68,19 @@ class Half(NamedTuple):
     units: Floats
     centre: Floats
     inverse_sd: Floats
-    measured: Measured | None
 
 
 def work(job: Job, task: Half) -> tuple[Floats, Floats]:
     """Fit texels given their neighbours: vectors and errors, (M, P), NaN where there is no finite fit."""
     problem = job.problem
-    rows = job.texels(job.measured(task.block, task.measured)).rows(task.places)
+    rows = job.texels(task.block)[1].rows(task.places)
     rows = rows._replace(centre=task.centre, inverse_sd=task.inverse_sd)
     best = fit_texels(problem, task.units, rows, job.options.chunk_size, fresh=False)
     errors, finite = standard_errors(problem, best, rows)[0], best.finite[:, None]
     return np.where(finite, best.vector, np.nan), np.where(finite, errors, np.nan)
 
 
-def smooth_map(store: Store, job: Job, data: MapData, client: Any, options: MapOptions) -> None:
+def smooth_map(store: Store, job: Job, client: Any, options: MapOptions) -> None:
     """Smooth a map that is fitted whole, into a group of its store, from where an earlier call stopped.
 
     Raises:
@@ -117,7 +113,7 @@ def smooth_map(store: Store, job: Job, data: MapData, client: Any, options: MapO
 
     while len(moves) < prior.rounds and not (moves and moves[-1] <= options.settled):
         note = f"the farthest moved by {moves[-1]:.2g} errors" if moves else ""
-        options.report("smoothing", len(moves), prior.rounds, note)
+        options.progress("smoothing", len(moves), prior.rounds, note)
         before, errors_before = units_now(), errors.copy()
         for colour in (0, 1):
             units = units_now()
@@ -127,8 +123,7 @@ def smooth_map(store: Store, job: Job, data: MapData, client: Any, options: MapO
             for block in blocks_of(fitted.shape, store.chunk):
                 if (mine := coloured[block]).any():
                     at, to, inverse_sd = (one[block][mine] for one in (units, centre, np.sqrt(precision)))
-                    measured = data.read(block) if job.data is None else None
-                    tasks.append(Half(block, np.flatnonzero(mine), at, to, inverse_sd, measured))
+                    tasks.append(Half(block, np.flatnonzero(mine), at, to, inverse_sd))
             for index, result in run(work, job, tasks, client=client):
                 block, places, *_ = tasks[index]
                 if isinstance(result, Failure):
@@ -157,4 +152,4 @@ def smooth_map(store: Store, job: Job, data: MapData, client: Any, options: MapO
             dimension_names=store.arrays["flags"].metadata.dimension_names,
             fill_value=np.nan,
         )
-    options.report("smoothing", len(moves), prior.rounds)
+    options.progress("smoothing", len(moves), prior.rounds)

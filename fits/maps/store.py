@@ -12,6 +12,7 @@ import itertools
 import os
 import shutil
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -22,18 +23,17 @@ from numpy.typing import NDArray
 from zarr.codecs import Crc32cCodec
 from zarr.core.sync import sync
 
-from fits._files import given_path, named, plain, require_there
+from fits._files import PARTIAL, given_path, named, plain, replacing, require_there, restore
 from fits._lazy import shown_by
 from fits.engines import one_line
 from fits.maps.inputs import Block
+from fits.maps.options import MapOptions
 from fits.store import another, differences
 
 Floats = NDArray[np.float64]
 
 KEY, KIND, FORMAT = "layerjax", "fitted map", 6
 PILOT, SMOOTHED = "pilot", "smoothed"
-PARTIAL = ".partial"
-"""How names end, here and in zarr, of what has not been written to its end."""
 
 FLAGS = {
     "fitted": 1,
@@ -107,9 +107,9 @@ class FittedMap:
             self.root = zarr.open_group(self.path, mode=mode)
             for name, array in self.arrays.items():
                 if array.shape != self.shape:
-                    raise ValueError(f"{name} has shape {array.shape}, must be {self.shape}")
+                    raise ValueError(f"the shape {array.shape} of {name}, which must be {self.shape}")
         except Exception as error:  # whatever a description that is none leads to
-            raise ValueError(f"{path}: damaged, {type(error).__name__} {one_line(error)}") from None
+            raise ValueError(f"{path}: damaged, its description lacks or misstates {one_line(error)}") from None
 
     @cached_property
     def arrays(self) -> dict[str, Any]:
@@ -190,8 +190,6 @@ class FittedMap:
 
     def option(self, name: str) -> Any:
         """A number of the `MapOptions` that the map was fitted with."""
-        from fits.maps.options import MapOptions
-
         return self.attributes["options"].get(name, getattr(MapOptions, name))
 
     def __getitem__(self, path: str) -> "zarr.Array[Any]":
@@ -248,14 +246,11 @@ def open_map(path: str | Path) -> FittedMap:
 def _attributes(path: Path) -> dict[str, Any]:
     """What the root of a store says under our key; ValueError for what is no such store."""
     require_there(path, "no such file or directory")
-    try:
+    with suppress(Exception):  # whatever else stands there
         about: Any = zarr.open_group(path, mode="r").attrs[KEY]
         if about["kind"] == KIND:
             return about
-        reason = f"it holds a {about['kind']}"
-    except Exception as error:  # whatever else stands there
-        reason = f"{type(error).__name__} {one_line(error)}"
-    raise ValueError(f"{path}: is no store of a {KIND}, as `layerjax fit-map` writes it ({reason})")
+    raise ValueError(f"{path}: is no store of a {KIND}, as `layerjax fit-map` writes it")
 
 
 # ---- writing ----
@@ -305,12 +300,8 @@ class Store(FittedMap):
     def save_group(self, name: str, arrays: Mapping[str, np.ndarray], about: Mapping[str, Any], **options: Any) -> None:
         """Write a group of arrays with what it says of itself, whole or not at all, in place of what is there; options:
         of the arrays, as zarr takes them. OSError: named."""
-        place, new = self.path / name, self.path / f"{name}{PARTIAL}"
-        with named(self.path):
-            shutil.rmtree(new, ignore_errors=True)
-            _write_group(self.root, new.name, arrays, about, **options)
-            shutil.rmtree(place, ignore_errors=True)
-            os.rename(new, place)
+        with named(self.path), replacing(self.path / name) as new:
+            _write_group(zarr.create_group(new), arrays, about, **options)
 
     def load_group(self, name: str) -> tuple[dict[str, np.ndarray], dict[str, Any]] | None:
         """The arrays of a group and what it says of itself; None where it is not there. ValueError: it is damaged."""
@@ -324,10 +315,7 @@ class Store(FittedMap):
             raise ValueError(f"{self.path}/{name}: damaged, {one_line(error)}; --force begins anew") from None
 
 
-def _write_group(
-    root: zarr.Group, name: str, arrays: Mapping[str, np.ndarray], about: Mapping[str, Any], **options: Any
-) -> None:
-    group = root.create_group(name)
+def _write_group(group: zarr.Group, arrays: Mapping[str, np.ndarray], about: Mapping[str, Any], **options: Any) -> None:
     for path, array in arrays.items():
         group.create_array(path, data=np.ascontiguousarray(array), compressors=CHECKSUM, **options)
     group.attrs.update({KEY: {"arrays": list(arrays), **plain(about)}})
@@ -342,28 +330,20 @@ def create(path: Path, attributes: Mapping[str, Any], pilot: Mapping[str, np.nda
     """
     names, units, shape = attributes["names"], attributes["units"], tuple(attributes["shape"])
     axes = {1: ["texel"], 2: ["row", "column"]}.get(len(shape), [f"axis_{axis}" for axis in range(len(shape))])
-    new = _scratch(path)
-    with named(path):
-        try:
-            root = zarr.create_group(new, attributes={KEY: plain({**attributes, "kind": KIND, "format": FORMAT})})
-            for name, (dtype, fill) in arrays_of(names).items():
-                root.create_array(
-                    name,
-                    shape=shape,
-                    chunks=tuple(attributes["chunk"]),
-                    dtype=dtype,
-                    fill_value=fill,
-                    compressors=CHECKSUM,
-                    dimension_names=axes,
-                    attributes=DESCRIPTIONS.get(name) or {"units": units[name.partition("/")[2]]},
-                )
-            _write_group(root, PILOT, pilot, {})
-        except BaseException:
-            shutil.rmtree(new, ignore_errors=True)
-            raise
-        if path.exists():
-            shutil.rmtree(path)
-        os.rename(new, path)
+    with named(path), replacing(path) as new:
+        root = zarr.create_group(new, attributes={KEY: plain({**attributes, "kind": KIND, "format": FORMAT})})
+        for name, (dtype, fill) in arrays_of(names).items():
+            root.create_array(
+                name,
+                shape=shape,
+                chunks=tuple(attributes["chunk"]),
+                dtype=dtype,
+                fill_value=fill,
+                compressors=CHECKSUM,
+                dimension_names=axes,
+                attributes=DESCRIPTIONS.get(name) or {"units": units[name.partition("/")[2]]},
+            )
+        _write_group(root.create_group(PILOT), pilot, {})
     return Store(path)
 
 
@@ -378,7 +358,7 @@ def resume(path: Path, identity: Mapping[str, str], force: bool) -> Store | None
     Raises:
         ValueError: something else is there, or a map of another fit (it names what differs), or a damaged one.
     """
-    shutil.rmtree(_scratch(path), ignore_errors=True)
+    restore(path)
     if not os.path.lexists(path):
         return None
     _attributes(path)  # what is not ours is never touched
@@ -394,8 +374,3 @@ def resume(path: Path, identity: Mapping[str, str], force: bool) -> Store | None
         raise
     store.clean()
     return store
-
-
-def _scratch(path: Path) -> Path:
-    """Where a store is made by the one process that holds the lock."""
-    return path.with_name(f".{path.name}.new{PARTIAL}")

@@ -43,14 +43,14 @@ class Comparison:
     Attributes:
         rows: best first.
         sorted_by: "elpd" (of held-out incidences), "aic" or "chi_square".
-        verdict: one sentence for each fit other than the best, that says whether the data prefer the best to it.
+        verdict: a sentence on a line for each fit other than the best, whether the data prefer the best to it.
         notes: cautions for reading the rows.
         options: the thresholds of verdict and notes.
     """
 
     rows: tuple[ComparedFit, ...]
     sorted_by: str
-    verdict: tuple[str, ...]
+    verdict: str
     notes: tuple[str, ...]
     options: ComparisonOptions
 
@@ -103,7 +103,7 @@ def compare(
     else:
         rows.sort(key=lambda row: row.fit.chi_square)
         sorted_by = "chi_square"
-    verdict = tuple(_verdict(rows[0], row, sorted_by, options) for row in rows[1:])
+    verdict = "\n".join(_verdict(rows[0], row, sorted_by, options) for row in rows[1:])
     return Comparison(tuple(rows), sorted_by, verdict, tuple(_notes(rows, options)), options)
 
 

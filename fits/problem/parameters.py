@@ -295,6 +295,12 @@ def with_values(tree: Any) -> Any:
     return jax.tree.map(lambda leaf: leaf.values() if is_law(leaf) else leaf, tree, is_leaf=is_law)
 
 
+def at_start(tree: Any) -> Any:
+    """The tree with every free parameter at its start."""
+    start = jax.tree.map(lambda leaf: jnp.asarray(leaf.arrays()[0]) if is_free(leaf) else leaf, tree, is_leaf=is_free)
+    return with_values(start)
+
+
 def require_in_range(material: Any) -> None:
     """Refuse power laws that leave the range of the numbers in whose place they stand: ValueError that names it."""
     for prefix, stack in stacks_by_name(material).items() if isinstance(material, lj.Stack | lj.Mixture) else ():

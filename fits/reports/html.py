@@ -105,12 +105,11 @@ class FitReport:
                 sampling.append(tables.posterior_table(self.estimates))
                 sampling.append(_picture(corner, "Samples of the posterior; orange: the best fit."))
 
-        residuals = [
-            *(one.sentence for one in verdicts.statements(facts)["residuals"]),
-            f"{verdicts.starts_in_words(fit)}.",
-        ]
+        residuals = [one.sentence for one in verdicts.statements(facts)["residuals"]]
+        residuals.append(f"{verdicts.starts_in_words(fit)}.")
         correlation = _picture(model.correlation_picture(fit), "Correlation of the fitted parameters.")
-        title, stack = f"Fit of {source_name(data)}", tomli_w.dumps(material_to_dict(fit.stack))
+        stack = tomli_w.dumps(material_to_dict(fit.stack))
+        title = f"Fit of {Path(data.source.path).name or f'{data.source.format} data'}"
         body = [
             f"<h1>{html.escape(title)}</h1>",
             verdict(opening.sentences, opening.sound),
@@ -128,13 +127,8 @@ class FitReport:
             picture = _picture(
                 model.curves_picture({self.name: fit, **fits_of(self.others)}), "The fits beside the data."
             )
-            body.append(section("Comparison", found.verdict, tables.comparison_table(found), picture))
+            body.append(section("Comparison", found.verdict.splitlines(), tables.comparison_table(found), picture))
         return document(title, [*body, made_with()])
-
-
-def source_name(data: Measurements) -> str:
-    """The file's name, or what the data is where there is none."""
-    return Path(data.source.path).name or f"{data.source.format} data"
 
 
 def _picture(figure: "Figure | None", caption: str) -> str:
@@ -167,7 +161,7 @@ def posterior_fragment(posterior: "Posterior") -> str:
 
 def comparison_fragment(comparison: "Comparison") -> str:
     """Which of several fits predicts the data best, and by how much."""
-    return _paragraph(list(comparison.verdict)) + html_table(tables.comparison_table(comparison))
+    return _paragraph([comparison.verdict]) + html_table(tables.comparison_table(comparison))
 
 
 def _paragraph(words: list[str]) -> str:

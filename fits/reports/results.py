@@ -9,7 +9,6 @@ chain.db       the posterior's chain, once sampled, and summary.json with its es
 report.html    the report, pictures inside
 """
 
-import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, fields, is_dataclass, replace
@@ -23,6 +22,7 @@ from fits._files import (
     given_path,
     locked,
     read_json,
+    replacing,
     require_switch,
     require_there,
     text_checksum,
@@ -58,9 +58,9 @@ def save_fit(fit: "Fit", directory: str | Path, force: bool = False) -> None:
         force: replace an earlier result.
 
     Raises:
-        ValueError: `directory` is not empty, unless `force` is given and it holds an earlier result; the transport is a
-            callable, or it or a part of the stack is of a class of one's own, which a file cannot name; or a channel
-            cannot be written (see `write_csv`); or the fit is of several measurements (see `Fit.part`).
+        ValueError: `directory` is not empty, unless `force` is given and it holds an earlier result; the transport or a
+            part of the stack is a function or class of one's own, which a file cannot name; the fit is of several
+            measurements (see `Fit.part`).
     """
     from fits.optimise.result import Fit
     from layerjax._checks import require_kind
@@ -142,10 +142,8 @@ def load_fit(directory: str | Path) -> "Fit":
         )
         alternatives = tuple(minima[index] for index in content["alternatives"])
         return Fit(problem=problem, minima=minima, alternatives=alternatives, **stored)
-    except (LookupError, TypeError, AttributeError, ArithmeticError, ValueError) as error:
-        if isinstance(error, ValueError) and str(error).startswith(str(directory)):
-            raise
-        raise ValueError(f"{directory / FIT}: damaged, {type(error).__name__} {error}") from None
+    except (LookupError, TypeError, AttributeError) as error:
+        raise ValueError(f"{directory / FIT}: damaged, it is not what `save_fit` writes") from error
 
 
 def _problem(directory: Path, content: dict[str, Any]) -> "Problem":
@@ -284,26 +282,11 @@ def writing(directory: str | Path, force: bool = False) -> Iterator[Path]:
     require_switch("force", force)
     check_directory(directory, force)
     target = directory.resolve()
-    folder, old = target.with_name(f".{target.name}.layerjax-new"), target.with_name(f".{target.name}.layerjax-old")
-    with locked(target.with_name(f".{target.name}.lock"), str(directory)):
-        # as a killed process left them
-        if old.exists() and not target.exists():
-            old.rename(target)
-        for left in (folder, old):
-            shutil.rmtree(left, ignore_errors=True)
+    with locked(target.with_name(f".{target.name}.lock"), str(directory)), replacing(target) as folder:
         try:
-            folder.mkdir()
             yield folder
-            check_directory(directory, force)  # someone else may have written there in the meantime
-            if target.exists():
-                with locked(target / LOCK, str(directory)):
-                    target.rename(old)
-            folder.rename(target)
-            shutil.rmtree(old, ignore_errors=True)
-        except BaseException as error:
-            shutil.rmtree(folder, ignore_errors=True)
-            if old.exists() and not target.exists():
-                old.rename(target)
-            if isinstance(error, OSError) and str(error.filename).startswith(f"{folder}"):
-                error.filename = f"{directory}{str(error.filename).removeprefix(str(folder))}"  # which the user knows
+        except OSError as error:
+            if str(error.filename).startswith(f"{folder}"):  # of which the user knows nothing
+                error.filename = f"{directory}{str(error.filename).removeprefix(str(folder))}"
             raise
+        check_directory(directory, force)  # someone else may have written there in the meantime

@@ -160,7 +160,8 @@ def unidentified_table(fit: "Fit") -> Table:
         "the other parameters fixed, in the parameter's own unit."
     )
     columns = ("direction", "error", "", "weights", "conditional errors")
-    return Table("Unidentified directions of parameter space", columns, tuple(rows), note)
+    kind = "Unidentified" if any(one.unconstrained for one in fit.unidentified) else "Weakly identified"
+    return Table(f"{kind} directions of parameter space", columns, tuple(rows), note)
 
 
 def posterior_table(posterior: "Posterior") -> Table:

@@ -51,6 +51,11 @@ class ReportOptions:
 
 DEFAULT = ReportOptions()
 
+NOISE_ASSUMED = (
+    f"No noise is stated: {100.0 * DEFAULT_RELATIVE:g} % of the model's value is assumed. State it as `relative` under "
+    "[noise], or by `--noise` of a search or a map."
+)
+
 
 # ---- residuals ----
 
@@ -354,8 +359,7 @@ def _remarks(f: Assessment) -> list[Statement]:
         error = numerical_error(f.numerical_error)
         remarks.append(Statement(f"The numerical error of the model is {error}: a finer resolution may change values."))
     if f.noise_assumed:
-        words = f"No noise is stated: {100.0 * DEFAULT_RELATIVE:g} % of the model's value is assumed."
-        remarks.append(Statement(f"{words} State it as `relative` under [noise], or `--noise` of a search."))
+        remarks.append(Statement(NOISE_ASSUMED))
     return remarks
 
 

@@ -84,7 +84,7 @@ def timed(job: Job, task: Block | Texelwise | Meeting) -> Timed:
 
 def redo(job: Job, task: Block) -> int:
     """A chunk as `fits.maps.fit_map.work` does it, also where it is done already; how many texels were fitted."""
-    results = fit_chunk(job, job.measured(task, None))
+    results = fit_chunk(job, task)
     job.store.write(task, results)
     return int(np.sum(results["flags"] & FLAGS["fitted"] > 0))
 
@@ -105,7 +105,7 @@ def empty(shared: Any, task: Any) -> Timed:
 
 def rows_of(job: Job, task: Texelwise) -> Texels:
     """The measurements of those texels."""
-    return job.texels(job.measured(task.task, None)).rows(list(task.places))
+    return job.texels(task.task)[1].rows(list(task.places))
 
 
 def first_starts(job: Job, rows: Texels) -> Floats:

@@ -56,13 +56,6 @@ def misfit(fit: "Fit") -> np.ndarray:
     return over_all_rows(fit, independent / residual_unit(fit))
 
 
-def residual_label(fit: "Fit") -> str:
-    """The name of an axis of a `misfit`."""
-    if not fit.is_posterior:
-        return f"residual of {fit.problem.objective} / its scatter"
-    return rf"(data $-$ {'with discrepancy' if fit.problem.noise.discrepancy else 'model'}) / $\sigma$"
-
-
 def curves_picture(fits: "dict[str, Fit]", posterior: "Posterior | None" = None) -> Figure | None:
     """Data and models per incidence against the signed viewing angle, with residuals in units of sigma below each.
 
@@ -204,7 +197,7 @@ def maps_picture(fit: "Fit", channel: int = 0) -> Figure | None:
                 axes.set_title(f"{incidence.label}: {what}")
         bar: dict[str, Any] = {"shrink": 0.7, "aspect": 30}
         figure.colorbar(image, ax=panels[:, :2].ravel().tolist(), label=value_label(data, channel), **bar)
-        label = residual_label(fit)
+        label = rf"(data $-$ {model}) / $\sigma$" if fit.is_posterior else "residual / its scatter"
         figure.colorbar(signed, ax=panels[:, 2].tolist(), label=label, extend="both", **bar)
     return figure
 
@@ -246,25 +239,20 @@ def corner_picture(posterior: "Posterior") -> Figure:
     """Every pair of parameters and every single parameter, over the posterior's samples; lines at the fitted values."""
     import corner
 
-    count = len(posterior.names)
-    side = float(np.clip(1.6 * count, 4.0, 11.0))
-    best = [posterior.fit.values[name] for name in posterior.names]
+    side = float(np.clip(1.6 * len(posterior.names), 4.0, 11.0))
     with mpl.rc_context(STYLE | {"axes.grid": False, "axes.titlesize": 8}):
         figure = Figure(figsize=(side, side))
         corner.corner(
             np.asarray(posterior.samples),
             labels=list(posterior.names),
-            titles=[f"{name}\n" for name in posterior.names],
             quantiles=(0.16, 0.5, 0.84),
             show_titles=True,
             title_fmt=".3g",
-            truths=best,
+            truths=[posterior.fit.values[name] for name in posterior.names],
             truth_color=CYCLE[1],
             color=CYCLE[0],
-            hist_kwargs={"color": CYCLE[0]},
             label_kwargs={"fontsize": 8},
             max_n_ticks=3,
-            labelpad=0.1,
             fig=figure,
             quiet=bool(posterior.modes),  # of modes narrower than a bin there are no contours
         )

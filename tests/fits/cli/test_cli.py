@@ -60,7 +60,6 @@ def test_results_are_compared(work, capsys, coat_fit):
     assert main(["compare", "worse", "best", "--no-refit"]) == 0
     words = capsys.readouterr().out
     assert words.index(" best ") < words.index(" worse ")
-    assert "twice" in refused(["compare", "best", "best/../best"], capsys, work)
     assert "cube_root" in refused(["compare", "best", "root"], capsys, work)
     assert "no posterior" in refused(["sample", "root"], capsys, work)
     assert main(["report", "best", "--compare", "worse"]) == 0

@@ -135,7 +135,7 @@ def test_an_interrupt_says_that_the_store_is_good(place, capsys, monkeypatch):
         ("map.npy=data.csv", "data.csv: a map is one array"),
         ("view.csv=coat.toml", "coat.toml, line"),
         ("coat.zarr=coat.h5", "coat.h5: a fitted map can be written as .zarr only"),
-        ("coat.zarr=file.zarr", "file.zarr: is a file"),
+        ("coat.zarr=file.zarr", "file.zarr: is no store of a fitted map"),
         ("--spatial-prior gaussian", "--spatial-prior needs --spatial-scale"),
         ("--spatial-prior gaussian --spatial-scale 0", "SpatialPrior.scale is 0.0; it must be a number"),
     ],

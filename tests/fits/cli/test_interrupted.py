@@ -105,7 +105,7 @@ def test_the_report_of_a_result_that_can_only_be_read_goes_elsewhere(work, capsy
     monkeypatch.setattr(FitReport, "page", lambda _: "drawn")
     save_fit(coat_fit, "result")
     with read_only(work / "result"):
-        assert "(--out FILE writes the report elsewhere)" in refusal(["report", "result"], capsys)
+        assert refusal(["report", "result"], capsys).startswith("layerjax: error: result/report.html: ")
         assert main(["report", "result", "--out", "report.html"]) == 0
         assert "chain.db.lock: " in refusal(["sample", "result"], capsys)
     assert (work / "report.html").read_text() == "drawn"

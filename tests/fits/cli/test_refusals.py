@@ -16,7 +16,7 @@ FIT = "fit data.csv --stack coat.toml --out result"
 
 REFUSALS = (
     ("info nowhere.csv", "nowhere.csv"),
-    ("info data.csv --out coat.toml", "--force"),
+    ("info data.csv --out data.csv", "pictures can be written as .png only"),
     ("info data.csv --read format=mrel", "format is 'mrel', must be one of csv, "),
     ("info data.csv --read csv", "'csv' is no option of a reader; it must be format=..., quantity=..., bins=..."),
     ("info data.csv --read format=csv format=csv", "format is given twice"),
@@ -39,7 +39,8 @@ REFUSALS = (
     ("simulate --stack coat.toml --incidence 20,95.5 --out new.csv", "a light at 95.5 degrees sees nothing"),
     ("sample .", "fit.json"),
     ("report nowhere", "nowhere"),
-    ("compare .", "two or more"),
+    ("compare .", "it holds no fit.json"),
+    ("compare saved", "at least 2 are needed"),
     ("predict saved --incidence 30 --score data.csv", "predict needs one of --incidence and --score"),
     ("predict saved --incidence 30", "predict --incidence needs --out FILE"),
     ("predict saved --incidence 30 --out new.txt", ".csv"),
@@ -48,7 +49,7 @@ REFUSALS = (
     ("render fabrik --out a.png", "neither a .toml file nor a material of the gallery: window_shade"),
     ("render fabric --out a.jpg", "pictures can be written as .png only"),
     ("fit-many scans", "no stack is given"),
-    ("fit-many scans --stacks coat.toml --read strata=flux", "lookup and strata apply to MERL files only"),
+    ("info data.csv --read strata=flux", "lookup and strata apply to MERL files only"),
 )
 
 

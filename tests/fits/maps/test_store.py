@@ -13,7 +13,8 @@ import zarr
 
 import fits
 import layerjax as lj
-from fits.maps.store import FLAGS, PARTIAL, SMOOTHED, Store, arrays_of, blocks_of, open_map
+from fits._files import PARTIAL
+from fits.maps.store import FLAGS, SMOOTHED, Store, arrays_of, blocks_of, open_map
 from tests.helpers.files import contents
 from tests.helpers.painted_maps import ATTRIBUTES, NAMES, UNITS, numbers, stored
 from tests.helpers.quick_maps import assert_same, coat, fitted, full_disk
@@ -128,10 +129,10 @@ def spoil_smoothed(path, *names):
         (lambda path: (shutil.rmtree(path), path.write_text("x")), "is no store of a fitted map"),
         (lambda path: (path / "zarr.json").unlink(), "is no store of a fitted map"),
         (lambda path: (path / "zarr.json").write_text("{"), "is no store of a fitted map"),
-        (lambda path: change_root(path, kind="x"), "it holds a x"),
+        (lambda path: change_root(path, kind="x"), "is no store of a fitted map"),
         (lambda path: change_root(path, format=1), "is version 1 of the"),
-        (lambda path: change_root(path, names=None), "damaged, KeyError 'names'"),
-        (lambda path: change_root(path, shape=[7, 9]), "has shape"),
+        (lambda path: change_root(path, names=None), "damaged, its description lacks or misstates 'names'"),
+        (lambda path: change_root(path, shape=[7, 9]), "misstates the shape"),
         (lambda path: shutil.rmtree(path / "flags"), "damaged, .*flags"),
         (lambda path: spoil_smoothed(path, "values", NAMES[0]), "smoothed/values/layers.0..thickness: damaged, "),
         (lambda path: spoil_smoothed(path), "smoothed: damaged, "),
@@ -194,7 +195,7 @@ def test_force_keeps_what_is_of_the_same_fit_and_a_map_until_there_can_be_anothe
     calls = []
     thresholds = {"converged_share": 0.5, "chi_square_sigmas": 5.0}  # of verdicts: they make no other fit
     fitted(out, measured, force=True, **thresholds, progress=lambda *call: calls.append(call))
-    assert calls == [("map", 4, 4, "")]
+    assert calls == [("map", 4, 4)]
 
     def interrupt(stage, *_):
         assert stage == "pilot"

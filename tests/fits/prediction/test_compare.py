@@ -44,12 +44,12 @@ def test_the_verdict_says_what_the_data_prefer(fits: dict) -> None:
     compared = compare(fits)
     aic, bic = (getattr(compared.rows[1], name) - getattr(compared.rows[0], name) for name in ("aic", "bic"))
     words = f"The data prefer line to flat: AIC difference {aic:.1f}, BIC difference {bic:.1f}."
-    assert compared.verdict == (words,)
+    assert compared.verdict == words
     slope, error = fits["line"].values["['b']"], fits["line"].standard_errors["['b']"]
     nearly = fit({"a": Free(0.9, -1.0, 3.0), "b": slope + 0.4 * error}, DATA, transport=line, starts=2)
     aic, bic = 2 - 0.16, math.log(COUNT) - 0.16  # a parameter less, for 0.4 standard errors
     words = f"other and line are statistically indistinguishable: AIC difference {aic:.1f}, BIC difference {bic:.1f}."
-    assert compare({"line": fits["line"], "other": nearly}).verdict == (words,)
+    assert compare({"line": fits["line"], "other": nearly}).verdict == words
 
 
 def test_a_misfit_counts_as_noise_in_the_verdict() -> None:
@@ -61,7 +61,7 @@ def test_a_misfit_counts_as_noise_in_the_verdict() -> None:
     assert 80 < best.fit.reduced_chi_square < 130
     gain = (other.fit.chi_square - best.fit.chi_square) / best.fit.reduced_chi_square
     words = f"AIC difference {gain - 2:.1f}, BIC difference {gain - math.log(COUNT):.1f} (noise scaled to the residuals"
-    assert words in comparison.verdict[0]
+    assert words in comparison.verdict
 
 
 def test_what_differs_is_said_or_refused(fits: dict) -> None:
@@ -83,7 +83,7 @@ def test_what_differs_is_said_or_refused(fits: dict) -> None:
 
 def test_thresholds_are_options(fits: dict) -> None:
     comparison = compare(fits, options=ComparisonOptions(slight_difference=1e6))
-    assert "line and flat are statistically indistinguishable" in comparison.verdict[0]
+    assert "line and flat are statistically indistinguishable" in comparison.verdict
     assert comparison.options.slight_difference == 1e6
     assert len(groups_of(DATA, ComparisonOptions(min_incidences=10**6, scan_parts=2))) <= 2
     for bad, message in (({"clear_difference": 0.0}, r"a number in \(0, inf\)"), ({"scan_parts": 1}, "of at least 2")):

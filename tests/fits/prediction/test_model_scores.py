@@ -233,7 +233,7 @@ def test_fits_are_ranked_by_elpd_and_averaged_by_stacking(found: Fit, flat: Fit)
     assert other.elpd_diff == pytest.approx(best.elpd - other.elpd)
     odds = np.exp(best.evidence.log_evidence - other.evidence.log_evidence)
     assert best.model_probability / other.model_probability == pytest.approx(odds)
-    assert "by cross-validation" in compared.verdict[0]
+    assert "by cross-validation" in compared.verdict
     table = tables.comparison_table(compared)
     assert {"elpd", "weight", "log evidence", "model probability"} <= set(table.columns)
     stacked = average(candidates)

@@ -194,8 +194,8 @@ def test_what_killed_processes_left_is_tidied_up(coat_fit: Fit, tmp_path: Path) 
     directory = tmp_path / "result"
     save_fit(coat_fit, directory)
     before = contents(directory)
-    directory.rename(tmp_path / ".result.layerjax-old")
-    (tmp_path / ".result.layerjax-new").mkdir()
+    directory.rename(tmp_path / ".result.old.partial")
+    (tmp_path / ".result.new.partial").mkdir()
     (tmp_path / ".result.lock").write_text("1\n")
     with pytest.raises(ValueError, match="holds a result already"):
         save_fit(coat_fit, directory)
