@@ -5,13 +5,7 @@ from pathlib import Path
 import pytest
 
 import layerjax as lj
-from fits.data.formats.csv import write_csv
-from fits.data.geometry import slices
-from fits.data.measurements import Measurements
-from fits.optimise.fit import fit
-from fits.optimise.result import Fit
-from fits.problem.simulate import simulate
-from fits.problem.stack_file import read_problem
+from fits import Fit, Measurements, fit, read_problem, simulate, slices, write_csv
 from tests.helpers.models import line_fit
 
 TRUE_ALBEDO, TRUE_THICKNESS = 0.4, 0.6

@@ -14,14 +14,12 @@ import numpy as np
 import pytest
 
 import layerjax as lj
+from fits import Problem, load_fit, load_posterior, read, save_fit
 from fits.cli import commands
 from fits.cli.arguments import COMMANDS
 from fits.cli.parser import main
-from fits.data.reading import read
 from fits.engines import run
-from fits.problem.problem import Problem
 from fits.reports.html import FitReport
-from fits.reports.results import load_fit, load_posterior, save_fit
 from tests.helpers import tasks
 from tests.helpers.coats import make_folder
 from tests.helpers.commands import refused

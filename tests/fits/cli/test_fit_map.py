@@ -7,11 +7,9 @@ import numpy as np
 import pytest
 
 import layerjax as lj
+from fits import MapOptions, Noise, SpatialPrior, open_map, slices
 from fits.cli.parser import main
-from fits.data.geometry import slices
-from fits.maps.options import MapOptions, SpatialPrior
-from fits.maps.store import FLAGS, open_map
-from fits.problem.noise import Noise
+from fits.maps.store import FLAGS
 from tests.helpers.commands import refused
 from tests.helpers.map_files import ANGLES, MASK, SIGMA, VALUES, hdf5_file
 from tests.helpers.painted_maps import numbers, stored, without

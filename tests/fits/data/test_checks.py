@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 import fits
-from fits.data.measurements import Measurements
 from fits.reports.data_summary import data_statements, energies, reciprocity, repeats, sides
 from tests.helpers.models import along
 from tests.helpers.places import COATINGS
@@ -18,11 +17,11 @@ SCANS = fits.slices(ANGLES)
 SIGNED = np.degrees(np.arctan2(SCANS.wo[:, 0], SCANS.wo[:, 2]))
 
 
-def measured(values, geometry=HEMISPHERE) -> Measurements:
+def measured(values, geometry=HEMISPHERE) -> fits.Measurements:
     return along(geometry, np.broadcast_to(values, len(geometry))[:, None])
 
 
-def statement(data: Measurements, of: str) -> str:
+def statement(data: fits.Measurements, of: str) -> str:
     return " ".join(words for words in data_statements(data) if words.startswith(f"{of}:"))
 
 

@@ -1,18 +1,13 @@
 """MERL tables: a file written from a formula in half and difference angles is looked up again, by angles or bins."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
-import layerjax as lj
+from fits import Geometry, read, slices
 from fits.cli.parser import main
 from fits.data.formats.merl import half_difference
-from fits.data.geometry import Geometry, direction, slices
-from fits.data.reading import read
+from fits.data.geometry import direction
 from fits.data.scans import in_plane, incidences, relative_azimuth
-from fits.optimise.fit import fit
-from fits.problem.parameters import Free
 from tests.helpers.commands import refused
 from tests.helpers.data_files import written
 from tests.helpers.merl import SCALE, SHAPE, centre_angles, centre_pairs, smooth_bsdf, write_merl
@@ -122,38 +117,6 @@ def test_light_along_the_normal_and_pairs_at_the_horizon(path):
         read(path, geometry=Geometry(low[0][:1], low[1][:1]))
 
 
-def flakes(thickness, albedo):
-    medium = lj.Medium(thickness=thickness, albedo=0.9, phase=lj.SGGX("surface", 0.02))
-    return lj.Stack([medium], base=lj.Lambertian(albedo=albedo))
-
-
-@pytest.fixture(scope="module")
-def flakes_path(tmp_path_factory):
-    """An exact table of flakes of thickness 0.8 over Lambertian(0.5), with values near the default slices only."""
-    wi, wo = centre_pairs(np.stack(np.unravel_index(np.arange(np.prod(SHAPE)), SHAPE), axis=-1))
-    near = np.zeros(len(wi), bool)
-    for theta in (10.5, 30.5, 50.5, 70.5):
-        near |= (abs(np.degrees(np.arccos([wi[:, 2], wo[:, 2]])) - theta) < 0.3).any(axis=0)
-    near &= (wi[:, 2] > 0) & (wo[:, 2] > 0)
-    values = np.full(len(wi), -1.0)
-    values[near] = lj.evaluate(flakes(0.8, 0.5), wi[near], wo[near], lj.SingleScattering())[:, 0]
-    return write_merl(
-        tmp_path_factory.mktemp("merl") / "flakes.binary", np.broadcast_to(values.reshape(SHAPE), (3, *SHAPE))
-    )
-
-
-@pytest.mark.slow
-def test_an_exact_table_gives_back_its_stack(flakes_path):
-    data = read(flakes_path)
-    assert data.mask.all()
-    data = replace(data, sigma=0.01 * data.values)
-    start = flakes(Free(1.5, 0.05, 5.0), Free(0.3, 0.0, 1.0))
-    found = fit(start, data, transport=lj.SingleScattering(), starts=2)
-    assert found.converged
-    assert found.values["layers[0].thickness"] == pytest.approx(0.8, abs=1e-7)
-    assert found.values["base.albedo"] == pytest.approx(0.5, abs=1e-7)
-
-
 def test_linear_lookup_recovers_the_formula(path, geometry, table):
     data = read(path, geometry=geometry, lookup="linear")
     np.testing.assert_array_equal([data.wi, data.wo], [geometry.wi, geometry.wo])
@@ -165,6 +128,7 @@ def test_linear_lookup_recovers_the_formula(path, geometry, table):
     assert data.mask.all()
     assert data.channels == ("red", "green", "blue")
     assert "centre at i + 1/2" in data.source.notes[0]
+    assert len(read(path, lookup="linear")) == 4 * (35 + 34 + 34)
     # mirror, normal and retro directions
     edges = Geometry(direction([30, 0, 30, 80, 0], 180), direction([30, 0, -30, 80, 85], 0))
     data, expected = read(path, geometry=edges, lookup="linear"), smooth_bsdf(*own_angles(edges)).T
@@ -175,13 +139,6 @@ def test_linear_lookup_recovers_the_formula(path, geometry, table):
 def test_nearest_lookup_takes_the_bin_of_the_database_code(path, geometry, table):
     data = read(path, geometry=geometry, lookup="nearest")
     np.testing.assert_allclose(data.values, table[:, *bins_of(own_angles(geometry)).T].T, rtol=1e-14)
-
-
-def test_default_slices(path):
-    data = read(path, lookup="linear")
-    assert len(data) == 4 * (35 + 34 + 34)
-    assert sorted(set(data.theta_i)) == [10, 30, 50, 70]
-    assert len(np.unique(np.hstack([data.wi, data.wo]).round(6), axis=0)) == len(data)
 
 
 def test_bins_without_measurement_are_masked(tmp_path, table):
@@ -207,8 +164,6 @@ def test_bins_that_hold_nan_are_left_out_and_counted(tmp_path, path, table):
     assert np.isfinite(every.values).all()
     assert "skipped: 2 bins of the table that hold nan" in every.source.notes
 
-
-# ---- many bins at once ----
 
 COUNT = 3000
 
@@ -272,9 +227,6 @@ def test_on_the_command_line(holed_path, tmp_path, capsys):
     assert "strata is given without a number of bins" in refused(words, capsys, tmp_path)
     assert main([*words, "bins=50"]) == 0
     assert len(read(tmp_path / "some.csv")) == 50
-
-
-# ---- what is refused ----
 
 
 def test_bad_arguments(holed_path):

@@ -3,11 +3,10 @@
 import numpy as np
 import pytest
 
+from fits import Geometry, read, slices
 from fits.data.formats import rgl
 from fits.data.formats._tensor_file import fields_as_bytes, read_fields
 from fits.data.formats.rgl_table import Table, read_table, table_as_bytes
-from fits.data.geometry import Geometry, slices
-from fits.data.reading import read
 from tests.helpers.data_files import written
 
 RGB = np.array([0.2, 0.5, 0.8])

@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 
 import layerjax as lj
+from fits import Sphere, Spheres, read, read_slab
 from fits.cli.parser import main
-from fits.data.formats.rxt import SMOOTH, read_slab
-from fits.data.reading import read
-from fits.data.spheres import Sphere, Spheres
+from fits.data.formats.rxt import SMOOTH
 from tests.helpers.data_files import RXT, written
 
 BARE, ONE = RXT.format(spheres=0), RXT.format(spheres=1)

@@ -6,11 +6,8 @@ import pytest
 from scipy import special
 
 import layerjax as lj
-from fits.data.spheres import Shares, Sphere, Spheres
-from fits.data.totals import Totals
-from fits.optimise.fit import fit
-from fits.problem.parameters import Free
-from fits.problem.problem import Problem
+from fits import Free, Problem, Sphere, Spheres, Totals, fit
+from fits.data.spheres import Shares
 
 FRONT = Sphere(100.0, 30.0, 15.0, 10.0, 0.95, 0.1)
 BEHIND = Sphere(80.0, 30.0, 0.0, 12.0, 0.97)

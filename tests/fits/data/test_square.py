@@ -9,8 +9,7 @@ RANDOM = np.random.default_rng(3)
 FIRST, SECOND = RANDOM.uniform(0.1, 2.0, (2, 5, 7))
 SECOND[:2] = 0.0
 SECOND[3, 2:5] = 0.0
-DENSITY = Density(np.stack([FIRST, SECOND]))
-"""Two densities, one of them with rows and cells that are 0."""
+DENSITY = Density(np.stack([FIRST, SECOND]))  # two densities, one of them with rows and cells that are 0
 
 
 def only(table, count):
@@ -40,11 +39,3 @@ def test_areas_of_the_drawn_hold_what_the_density_says(table):
     right, _, _ = DENSITY.undrawn(x + step, y, only(table, 2))
     _, up, _ = DENSITY.undrawn(x, y + step, only(table, 2))
     np.testing.assert_allclose((right - sx) * (up - sy) / step**2, value, rtol=1e-4)
-
-
-def test_between_tables_all_is_linear():
-    x, y = np.array([0.4]), np.array([0.7])
-    both = Interpolation(np.array([[0, 1]]), np.array([[0.25, 0.75]]))
-    mixed = Density(0.25 * DENSITY.tables[:1] + 0.75 * DENSITY.tables[1:])
-    np.testing.assert_allclose(DENSITY.undrawn(x, y, both), mixed.undrawn(x, y), rtol=1e-12)
-    np.testing.assert_allclose(bilinear(DENSITY.tables, x, y, both), bilinear(mixed.tables, x, y), rtol=1e-12)

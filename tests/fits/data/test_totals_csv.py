@@ -5,10 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fits.data.formats import write_csv
+from fits import Totals, read, write_csv
 from fits.data.geometry import direction
-from fits.data.reading import read
-from fits.data.totals import Totals
 
 HEADER = "theta_i,total_reflectance,total_reflectance_std,total_transmittance,total_transmittance_std"
 
@@ -26,8 +24,8 @@ def test_every_cell_is_a_reading(reading):
 
 @pytest.mark.parametrize("missing", ["", "nan", "NA"])
 def test_rows_without_any_value_are_counted(reading, missing):
-    head = "theta_i,total_reflectance,total_transmittance\n"
-    found = reading(f"{head}0,0.3,0.5\n10,{missing},{missing}\n20,0.3,{missing}\n30,{missing},{missing}\n")
+    rows = f"0,0.3,0.5\n10,{missing},{missing}\n20,0.3,{missing}\n30,{missing},{missing}\n"
+    found = reading(f"theta_i,total_reflectance,total_transmittance\n{rows}")
     np.testing.assert_allclose(found.values[:, 0], [0.3, 0.3, 0.5])
     assert found.source.notes == ("skipped: 2 rows without a value (an empty cell, or nan)",)
 

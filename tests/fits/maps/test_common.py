@@ -9,12 +9,10 @@ import pytest
 
 import fits
 import layerjax as lj
-from fits.data.measurements import Measurements
+from fits import MapOptions, Measurements, PowerLaw, read_problem, write_problem
 from fits.maps.common import fit_common, newton_step, with_common
-from fits.maps.options import MapOptions
 from fits.maps.texels import make_texels
-from fits.problem.parameters import PowerLaw, is_free
-from fits.problem.stack_file import read_problem, write_problem
+from fits.problem.parameters import is_free
 
 TRANSPORT = lj.SingleScattering()
 NOISE = fits.Noise(relative=0.02, floor=1e-4, discrepancy=False)

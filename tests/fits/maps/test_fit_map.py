@@ -12,17 +12,13 @@ from scipy.optimize import least_squares
 
 import fits
 import layerjax as lj
-from fits.data.geometry import Geometry
-from fits.data.measurements import Measurements
 from fits.maps.fit_map import tile
-from fits.maps.options import MapOptions
 from fits.maps.report import summarise, verdict
 from tests.helpers import quick_maps
 from tests.helpers.quick_maps import FREE, NAMES, NOISE, TRANSPORT, assert_same, fitted
 
 SHAPE = (8, 8)
-CLOSE = 2e-3
-"""Standard errors that a converged fit may be off by, times twenty: it has converged within 1e-4."""
+CLOSE = 2e-3  # standard errors that a converged fit may be off by, times twenty: it has converged within 1e-4
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +38,7 @@ def partial(tmp_path_factory, holes):
 
 def data_of(geometry, values):
     used = np.isfinite(values)
-    return Measurements(geometry.wi, geometry.wo, np.where(used, values, 0.0), None, used[:, 0], ("value",))
+    return fits.Measurements(geometry.wi, geometry.wo, np.where(used, values, 0.0), None, used[:, 0], ("value",))
 
 
 def distance(map, expected, where=Ellipsis, there=Ellipsis):
@@ -109,7 +105,7 @@ def test_every_texel_may_have_directions_of_its_own(tmp_path, geometry):
     wo = np.stack([geometry.wo @ tilt.T for tilt in tilts])
     keep = np.all(wo[..., 2] > 0.05, axis=0)
     wi, wo = np.stack([geometry.wi[keep]] * 4), wo[:, keep]
-    own = [Geometry(*pair) for pair in zip(wi, wo, strict=True)]
+    own = [fits.Geometry(*pair) for pair in zip(wi, wo, strict=True)]
     values = np.stack([quick_maps.seen(np.array([0.6, 0.5]), one) for one in own])
     noise = fits.Noise(relative=0.02, floor=1e-4)
     map = fitted(tmp_path / "own.zarr", values, view=(wi, wo), noise=noise)
@@ -130,7 +126,7 @@ def test_thresholds_of_flags_are_options(tmp_path, measured):
     thresholds = {"poor_probability": 0.5, "pilot_quantile": 0.0, "pilot_factor": 0.01}
     map = fitted(tmp_path / "map.zarr", measured, **thresholds, restarts=0)
     assert 0.2 < map.has("poor").sum() / map.has("fitted").sum() < 0.8
-    assert (map.option("poor_probability"), map.option("numerical_error")) == (0.5, MapOptions.numerical_error)
+    assert (map.option("poor_probability"), map.option("numerical_error")) == (0.5, fits.MapOptions.numerical_error)
 
 
 # ---- maps of all kinds ----

@@ -21,8 +21,7 @@ from tests.helpers.painted_maps import ATTRIBUTES, FREEDOM, GOOD, NAMES, bounded
 SHAPE, CHUNK = (20, 30), (10, 10)
 PLACES = np.arange(600).reshape(SHAPE)
 RATIO = numbers(SHAPE)["reduced_chi_square"]
-FULL = 8
-"""Pictures of a map of three parameters: two of each, flags, chi-square."""
+FULL = 8  # pictures of a map of three parameters: two of each, flags, chi-square
 
 
 @pytest.fixture(scope="module")

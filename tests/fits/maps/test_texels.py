@@ -12,7 +12,6 @@ from fits.maps.search import search, starts_at
 from fits.maps.texels import fit_texels, linearise_at, make_texels, standard_errors, to_units, with_own_directions
 from fits.optimise.levenberg_marquardt import COST_TOLERANCE, descend
 from fits.problem.compilation import _program
-from fits.problem.problem import Problem
 from tests.helpers import quick_maps
 from tests.helpers.quick_maps import FREE, TRANSPORT
 
@@ -34,7 +33,7 @@ def noisy(geometry):
 def problem_of(geometry, noise, values=None, objective="likelihood"):
     values = np.ones((len(geometry.wi), 1)) if values is None else values
     data = fits.Measurements(geometry.wi, geometry.wo, values, None, np.ones(len(values), bool), ("bsdf",))
-    return Problem(FREE, data, transport=TRANSPORT, noise=noise, objective=objective)
+    return fits.Problem(FREE, data, transport=TRANSPORT, noise=noise, objective=objective)
 
 
 @pytest.mark.parametrize(("noise", "objective"), [(LEVELS, "likelihood"), (FIXED, "cube_root")], ids=["free", "named"])

@@ -6,17 +6,11 @@ import numpy as np
 import pytest
 
 from benchmarks.measuring.repeats import fit_many
-from fits.data.geometry import slices
-from fits.data.measurements import Measurements
+from fits import Discrepancy, Free, Measurements, Noise, Posterior, Problem, fit, load_fit, save_fit, slices
 from fits.optimise import multi_start as starts_module
-from fits.optimise.fit import fit, without_discrepancy
-from fits.problem.discrepancy import Discrepancy, log_scales, places
-from fits.problem.noise import Noise
-from fits.problem.parameters import Free
-from fits.problem.problem import Problem
+from fits.optimise.fit import without_discrepancy
+from fits.problem.discrepancy import log_scales, places
 from fits.reports import verdicts
-from fits.reports.results import load_fit, save_fit
-from fits.sampling.posterior import Posterior
 from tests.helpers.models import line
 
 STACK = {"a": Free(0.9, 0.1, 3.0), "b": Free(0.1, -1.0, 3.0)}

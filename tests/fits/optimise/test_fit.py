@@ -8,16 +8,11 @@ from scipy.optimize import least_squares
 
 import layerjax as lj
 from benchmarks.measuring.repeats import fit_many
-from fits.data.geometry import slices
-from fits.optimise.fit import fit, start_points
+from fits import Direction, FitOptions, Free, LogNormal, LogUniform, Noise, Normal, Problem, fit, simulate, slices
+from fits.optimise.fit import start_points
 from fits.optimise.levenberg_marquardt import COST_TOLERANCE
-from fits.optimise.options import FitOptions, options_from
-from fits.optimise.uncertainty import Direction
+from fits.optimise.options import options_from
 from fits.problem.compilation import _program
-from fits.problem.noise import Noise
-from fits.problem.parameters import Free, LogNormal, LogUniform, Normal
-from fits.problem.problem import Problem
-from fits.problem.simulate import simulate
 from fits.reports import verdicts
 from tests.helpers.models import LINE, LOBE, LOBE_STACK, design, line, line_data, lobe, measured, noisy_lobe
 

@@ -4,14 +4,9 @@ import numpy as np
 import pytest
 
 import layerjax as lj
-from fits.data.formats.rxt import read_slab
-from fits.optimise.fit import fit
-from fits.problem.parameters import Free, LogUniform
-from fits.problem.problem import Problem
+from fits import Free, LogUniform, Problem, fit, read_slab
 
-WITHIN = 0.02
-"""What is asked of coefficients, relative to iad's."""
-
+WITHIN = 0.02  # what is asked of coefficients, relative to iad's
 PDMS = """\
 IAD1
 1.41  # Index of refraction of sample

@@ -9,7 +9,6 @@ import fits
 import layerjax as lj
 from benchmarks.measuring.cones import mean_over_cones
 from fits.optimise.limits import finest_step, instrument_limits
-from fits.problem.parameters import Free, LogUniform
 from fits.reports import verdicts
 from fits.reports.tables import parameter_table
 
@@ -26,7 +25,7 @@ def fitted(alpha, step=1.0, instrument=None):
     if instrument is not None:
         seen = mean_over_cones(metal(alpha), geometry.wi, geometry.wo, 0.0, instrument.detector_aperture)
         data = replace(data, values=seen * data.values / lj.evaluate(metal(alpha), geometry.wi, geometry.wo, SINGLE))
-    free = metal(Free(0.1, 1e-3, 1.0, LogUniform()))
+    free = metal(fits.Free(0.1, 1e-3, 1.0, fits.LogUniform()))
     return fits.fit(free, data, transport=SINGLE, starts=4, instrument=instrument)
 
 
@@ -60,7 +59,7 @@ def test_the_finest_scan_about_the_mirror_counts():
 
 def test_parts_of_mixtures_have_limits_of_their_own():
     geometry = fits.slices([30.0], np.arange(-80.0, 81.0, 1.0))
-    parts = {"smooth": metal(Free(0.02, 1e-3, 0.1)), "rough": metal(Free(0.3, 0.1, 1.0))}
+    parts = {"smooth": metal(fits.Free(0.02, 1e-3, 0.1)), "rough": metal(fits.Free(0.3, 0.1, 1.0))}
     truth = lj.Mixture({"smooth": metal(0.005), "rough": metal(0.4)}, [0.2, 0.8])
     data = fits.simulate(truth, geometry, SINGLE, 0.01, 1e-4)
     found = fits.fit(lj.Mixture(parts, [0.2, 0.8]), data, transport=SINGLE, starts=4)

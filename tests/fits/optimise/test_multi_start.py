@@ -6,18 +6,11 @@ import numpy as np
 import pytest
 
 import layerjax as lj
-from fits.data.geometry import slices
-from fits.data.reading import read
+from fits import Free, LogUniform, Noise, Problem, fit, read, read_problem, simulate, slices
 from fits.optimise import multi_start as starts_module
-from fits.optimise.fit import fit
 from fits.optimise.levenberg_marquardt import evaluate_at
 from fits.optimise.multi_start import LEAST_GAIN, multi_start, start_points, starts_store, unit_of
 from fits.optimise.result import OUTCOMES
-from fits.problem.noise import Noise
-from fits.problem.parameters import Free, LogUniform
-from fits.problem.problem import Problem
-from fits.problem.simulate import simulate
-from fits.problem.stack_file import read_problem
 from tests.helpers.models import LINE, LOBE, LOBE_STACK, directions, line, line_data, lobe, measured, noisy_lobe
 from tests.helpers.places import EXAMPLES
 

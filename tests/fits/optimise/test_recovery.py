@@ -11,8 +11,6 @@ import pytest
 
 import fits
 import layerjax as lj
-from fits.problem.parameters import Free, LogNormal
-from fits.problem.simulate import simulate, slices
 from fits.reports import verdicts
 from layerjax.precompute.vmf_diffuse.half_space import all_orders, half_space
 
@@ -29,12 +27,12 @@ def assert_recovered(fit, truth, errors=3.0):
 # ---- sand, from the solution of light between its flakes: which rough diffuse surface explains it ----
 
 ALBEDO, ROUGHNESS, MODES = (0.518, 0.331, 0.184), 0.5, 5
-COLOURS, WIDTH = Free([0.4, 0.4, 0.4], 0.0, 1.0), Free(0.4, 0.0, 1.0)
+COLOURS, WIDTH = fits.Free([0.4, 0.4, 0.4], 0.0, 1.0), fits.Free(0.4, 0.0, 1.0)
 
 
 def sand():
     """Of values of the half-space itself, not of the table that is fitted, with 3 % noise."""
-    geometry = slices(incidence=(10, 35, 60, 75), outgoing=np.arange(-80, 81, 10), azimuth=(0, 90))
+    geometry = fits.slices(incidence=(10, 35, 60, 75), outgoing=np.arange(-80, 81, 10), azimuth=(0, 90))
     cosines, places = np.unique(np.round([geometry.wi[:, 2], geometry.wo[:, 2]], 12), return_inverse=True)
     space = half_space(-np.log1p(-np.sqrt(ROUGHNESS)), 24, MODES, tuple(cosines))
     i, o = places.reshape(2, -1) + 24
@@ -43,7 +41,7 @@ def sand():
         [sum((2 if m else 1) * all_orders(space, c, m)[i, o] * np.cos(m * turn) for m in range(MODES)) for c in ALBEDO],
         axis=-1,
     )
-    data = simulate(lj.Stack([], lj.Lambertian(ALBEDO)), geometry)
+    data = fits.simulate(lj.Stack([], lj.Lambertian(ALBEDO)), geometry)
     noisy = exact * (1 + 0.03 * np.random.default_rng(3).standard_normal(exact.shape))
     sand = replace(data, values=noisy, sigma=0.03 * exact)
     surfaces = {
@@ -93,15 +91,15 @@ def returned(ior, thickness, n, k):
 def coated_copper():
     """All six numbers free; of the metal a handbook's median with a factor of 1.6 either way is known beforehand."""
     transport = lj.Statistical(facet_multiple_scattering=False)
-    geometry = slices(incidence=(10, 35, 60), outgoing=np.arange(-80, 81, 10), azimuth=(0, 90))
-    data = simulate(coat(*METAL.values()), geometry, transport=transport, noise=0.03, seed=1)
+    geometry = fits.slices(incidence=(10, 35, 60), outgoing=np.arange(-80, 81, 10), azimuth=(0, 90))
+    data = fits.simulate(coat(*METAL.values()), geometry, transport=transport, noise=0.03, seed=1)
     free = coat(
-        Free(1.4, 1.2, 2.2),
-        Free(0.2, 0.02, 0.6),
-        Free(0.5, 0.01, 3.0),
-        Free(1.0, 0.05, 6.0, LogNormal(1.0, 0.5)),
-        Free(3.0, 0.5, 10.0, LogNormal(3.0, 0.5)),
-        Free(0.2, 0.02, 0.8),
+        fits.Free(1.4, 1.2, 2.2),
+        fits.Free(0.2, 0.02, 0.6),
+        fits.Free(0.5, 0.01, 3.0),
+        fits.Free(1.0, 0.05, 6.0, fits.LogNormal(1.0, 0.5)),
+        fits.Free(3.0, 0.5, 10.0, fits.LogNormal(3.0, 0.5)),
+        fits.Free(0.2, 0.02, 0.8),
     )
     fit = fits.fit(free, data, transport=transport, starts=2, seed=0)
     assert_recovered(fit, METAL)

@@ -6,16 +6,11 @@ import numpy as np
 import pytest
 
 import layerjax as lj
-from fits.data.geometry import slices
+from fits import Free, Noise, Problem, fit, simulate, slices
 from fits.optimise import multi_start as starts_module
 from fits.optimise import resolution as resolution_module
-from fits.optimise.fit import fit
 from fits.optimise.options import DEFAULT
 from fits.optimise.resolution import LEAST_SCATTER, resolutions, spread
-from fits.problem.noise import Noise
-from fits.problem.parameters import Free
-from fits.problem.problem import Problem
-from fits.problem.simulate import simulate
 from fits.reports import results, verdicts
 from tests.helpers.models import LINE, TRUTH, line, line_data
 

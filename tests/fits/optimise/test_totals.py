@@ -7,14 +7,7 @@ import pytest
 from scipy.special import expn
 
 import layerjax as lj
-from fits.data.geometry import slices
-from fits.data.totals import Totals
-from fits.optimise.fit import fit
-from fits.problem.instrument import Instrument
-from fits.problem.noise import Noise
-from fits.problem.parameters import Free
-from fits.problem.problem import Joint, Problem
-from fits.problem.simulate import simulate
+from fits import Free, Instrument, Joint, Noise, Problem, Totals, fit, simulate, slices
 
 SINGLE = lj.SingleScattering()
 ANGLES = np.array([0.0, 60.0])

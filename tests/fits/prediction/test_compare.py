@@ -6,11 +6,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from fits.optimise.fit import fit
-from fits.prediction.compare import compare
+from fits import ComparisonOptions, Free, compare, fit
 from fits.prediction.cross_validation import groups_of
-from fits.prediction.options import ComparisonOptions
-from fits.problem.parameters import Free
 from tests.helpers.models import design, line, measured
 
 COUNT = 120

@@ -6,18 +6,10 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from fits.data.geometry import slices
-from fits.data.measurements import Measurements
+from fits import Discrepancy, Fit, Free, Measurements, Noise, Problem, fit, predict, sample, scores, slices
 from fits.data.scans import select
-from fits.optimise.fit import fit
-from fits.optimise.result import Fit
-from fits.prediction.predict import LEVELS, predict, scores
-from fits.problem.discrepancy import Discrepancy
-from fits.problem.noise import Noise
-from fits.problem.parameters import Free
-from fits.problem.problem import Problem
+from fits.prediction.predict import LEVELS
 from fits.reports.tables import UNRELIABLE, scores_table
-from fits.sampling.sample import sample
 from tests.helpers.models import COUNT, along, design, directions, drawn_discrepancy, line, line_fit, measured
 
 STACK = {"a": Free(0.9, 0.1, 3.0), "b": Free(0.1, -1.0, 3.0)}

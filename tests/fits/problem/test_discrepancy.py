@@ -6,13 +6,10 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from fits.data.geometry import slices
-from fits.data.measurements import Measurements, channel_names
-from fits.problem.discrepancy import Correlation, Discrepancy, make_process, places
+from fits import Discrepancy, Free, LogNormal, Measurements, Noise, Problem, slices
+from fits.data.measurements import channel_names
+from fits.problem.discrepancy import Correlation, make_process, places
 from fits.problem.model import Model
-from fits.problem.noise import Noise
-from fits.problem.parameters import Free, LogNormal
-from fits.problem.problem import Problem
 from tests.helpers.models import along
 
 FREE = Free(0.4, 0.0, 1.0)

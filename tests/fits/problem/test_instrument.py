@@ -11,11 +11,9 @@ import fits
 import layerjax as lj
 from benchmarks.measuring.cones import mean_over_cones
 from benchmarks.measuring.repeats import fit_many
+from fits import Free, Instrument, LogNormal, LogUniform, Problem
 from fits.data.geometry import direction
-from fits.problem.instrument import Instrument
 from fits.problem.model import Model
-from fits.problem.parameters import Free, LogNormal, LogUniform
-from fits.problem.problem import Problem
 from tests.helpers.models import along
 
 SINGLE = lj.SingleScattering()

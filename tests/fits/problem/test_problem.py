@@ -11,16 +11,8 @@ import pytest
 from scipy import integrate, stats
 
 import layerjax as lj
-from fits.problem.noise import (
-    Noise,
-    information_weights,
-    log_density,
-    named_residual,
-    tail_residual,
-)
-from fits.problem.parameters import Free, LogNormal, LogUniform, Normal
-from fits.problem.problem import Problem
-from fits.problem.simulate import simulate, slices
+from fits import Free, LogNormal, LogUniform, Noise, Normal, Problem, simulate, slices
+from fits.problem.noise import information_weights, log_density, named_residual, tail_residual
 from tests.helpers.models import design, line, measured
 
 COUNT = 40

@@ -10,25 +10,21 @@ from scipy import special, stats
 
 import fits
 import layerjax as lj
-from fits.optimise.fit import fit
-from fits.optimise.result import Fit
+from fits import Fit, Free, Normal, Posterior, SamplerOptions, Uniform, fit, sample
 from fits.prediction.importance import importance_draws
-from fits.problem.parameters import Free, Normal, Prior, Uniform
+from fits.problem.parameters import Prior
 from fits.reports import verdicts
 from fits.reports.tables import parameter_table, posterior_table
 from fits.sampling.convergence import Convergence
 from fits.sampling.initial import initial_mixture
-from fits.sampling.options import SamplerOptions
-from fits.sampling.posterior import Posterior
-from fits.sampling.sample import Sampler, load, sample
+from fits.sampling.sample import Sampler, load
 from tests.helpers.models import COUNT, design, measured
 
 SIGMA, HIGH = 0.01, 3.0
 COSINE = design(COUNT)[:, 1:]
 EXACT = np.exp(-0.3 / COSINE) + np.exp(-1.5 / COSINE)
 DATA = measured(EXACT + SIGMA * np.random.default_rng(0).standard_normal(EXACT.shape), SIGMA)
-NARROW = 0.8
-"""Of a normal prior on the first of two numbers, which makes one mode likelier."""
+NARROW = 0.8  # of a normal prior on the first of two numbers, which makes one mode likelier
 
 
 def pair(stack, wi, wo):

@@ -6,12 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from fits import Fit, Posterior, load_posterior, sample, save_fit
 from fits.cli.parser import main
-from fits.optimise.result import Fit
-from fits.reports.results import load_posterior, save_fit
 from fits.sampling.nuts import Nuts, _step
-from fits.sampling.posterior import Posterior
-from fits.sampling.sample import load, sample, settings
+from fits.sampling.sample import load, settings
 
 pytest.importorskip("blackjax")
 

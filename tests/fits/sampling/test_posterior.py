@@ -15,14 +15,11 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from fits.optimise.fit import fit
-from fits.optimise.result import Fit
-from fits.problem.parameters import Free
+from fits import Fit, Free, SamplerOptions, fit, sample
 from fits.sampling.chain import Chain
 from fits.sampling.ensemble import proposals_of
 from fits.sampling.initial import initial_mixture
-from fits.sampling.options import SamplerOptions
-from fits.sampling.sample import load, sample, settings
+from fits.sampling.sample import load, settings
 from fits.store import Store
 from tests.helpers.models import COUNT, design, line, line_data, line_fit, measured, student_fit
 from tests.helpers.places import ROOT

@@ -7,9 +7,7 @@ import pytest
 from scipy import stats
 
 import layerjax as lj
-from fits.optimise.fit import fit
-from fits.problem.parameters import Free, LogUniform
-from fits.sampling.sample import sample
+from fits import Free, LogUniform, fit, sample
 from tests.helpers.models import directions, measured
 
 COUNT, SIGMA, LEVEL = 40, 0.005, 0.5

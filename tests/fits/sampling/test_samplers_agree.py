@@ -5,11 +5,8 @@ from typing import get_args
 import numpy as np
 import pytest
 
-from fits.optimise.fit import fit
-from fits.optimise.result import Fit
-from fits.problem.parameters import Free
-from fits.sampling.posterior import Posterior
-from fits.sampling.sample import Sampler, sample
+from fits import Fit, Free, Posterior, fit, sample
+from fits.sampling.sample import Sampler
 from tests.helpers.models import COUNT, LINE, LOBE_STACK, design, line, line_data, lobe, noisy_lobe, student_fit
 
 pytest.importorskip("blackjax")
