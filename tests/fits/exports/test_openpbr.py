@@ -14,7 +14,6 @@ import layerjax as lj
 from fits.cli.parser import main
 from fits.exports.openpbr import surface as model
 from fits.exports.openpbr.document import inputs
-from fits.exports.openpbr.start import starts
 from fits.exports.openpbr.surface import EDGE, Surface, metal_reflectance
 from tests.helpers.commands import refused
 
@@ -108,23 +107,6 @@ def test_known_limits():
     np.testing.assert_allclose(metal_reflectance(jnp.ones(1), color, tint), color)
     schlick = color + (1.0 - color) * (1.0 - EDGE) ** 5
     np.testing.assert_allclose(metal_reflectance(jnp.array([EDGE]), color, tint), tint * schlick)
-
-
-def test_layers_say_where_the_fit_starts():
-    (metal,) = starts((lj.Stack([lj.Interface(1.5, 0.04)], COPPER),))
-    assert metal.lobes == ("coat", "metal")
-    n, k = np.array([0.2, 0.9, 1.1]) / 1.5, np.array([3.9, 2.4, 2.2]) / 1.5
-    np.testing.assert_allclose(metal.base_color, ((n - 1) ** 2 + k**2) / ((n + 1) ** 2 + k**2), rtol=1e-5)
-    assert (metal.coat_ior, metal.coat_roughness) == pytest.approx((1.5, 0.2))
-    assert metal.specular_roughness == pytest.approx(0.4)
-    (two,) = starts((lj.Stack([lj.Interface(1.3, 0.04), lj.Interface(1.6, 0.25)], lj.Lambertian(RED)),))
-    assert two.lobes == ("coat", "gloss", "diffuse")
-    assert (two.coat_ior, two.specular_ior, two.specular_roughness) == pytest.approx((1.3, 1.6, 0.5))
-    (one,) = starts((lj.Stack([lj.Interface(1.5, 0.04)], lj.Lambertian(RED)),))
-    assert one.lobes == ("gloss", "diffuse")
-    assert [one.lobes for one in starts((lj.gallery.stack("rough_copper"),))] == [("gloss", "diffuse"), ("metal",)]
-    flakes = lj.Stack([lj.Interface(1.5, 0.04), lj.Medium(1.0, phase=lj.SGGX("surface", 0.3))], lj.Lambertian(RED))
-    assert [one.lobes for one in starts((flakes,))] == [("coat", "gloss", "diffuse"), ("coat", "metal", "diffuse")]
 
 
 def read(path):
