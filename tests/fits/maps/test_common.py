@@ -103,9 +103,6 @@ def test_a_map_holds_what_its_texels_have_in_common(tmp_path, fitted):
     assert not (tmp_path / "none.zarr").exists()
 
 
-# ---- which they are, and the problem with them held ----
-
-
 HAZE = lj.Medium(
     fits.Free(0.5, 0.1, 2.0), [0.5, 0.6, 0.7], lj.HenyeyGreenstein(fits.Free(0.3, 0.0, 0.9, same_for_all_texels=True))
 )

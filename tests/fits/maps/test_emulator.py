@@ -8,7 +8,7 @@ from scipy.stats import qmc
 
 import fits
 import layerjax as lj
-from fits.maps.emulator import chebyshev, emulate, with_emulator
+from fits.maps.emulator import emulate, with_emulator
 from fits.problem.model import Model
 
 ERROR = fits.MapOptions.emulator_error
@@ -75,11 +75,6 @@ def test_derivatives_are_those_of_the_emulator(emulated, vectors):
     assert np.all(slopes[:, 0, second] == 0.0)
     assert np.all(slopes[:, 1, first] == 0.0)
     assert np.any(slopes[:, 0, first] != 0.0)
-
-
-def test_chebyshev_polynomials_are_cosines():
-    x = np.array([-1.0, -0.3, 0.0, 0.8, 1.0])
-    np.testing.assert_allclose(chebyshev(jnp.asarray(x), 6), np.cos(np.arange(6)[:, None] * np.arccos(x)), atol=1e-12)
 
 
 def test_too_dear_an_emulator_is_not_made(problem):

@@ -46,9 +46,6 @@ def map(painted, tmp_path_factory):
     return stored(tmp_path_factory.mktemp("map") / "<coat> & co.zarr", painted, CHUNK, numerical={"error": 0.025})
 
 
-# ---- numbers, tables and sentences ----
-
-
 def test_counts_quartiles_and_the_verdict_are_those_of_the_arrays(map, painted):
     numbers, fitted = summarise(map), np.isfinite(painted["reduced_chi_square"])
     counts = {"fitted": 541, "converged": 537, "at_bound": 25, "poor": 12, "restarted": 0, "masked": 29, "failed": 10}
@@ -155,9 +152,6 @@ def test_nearly_all_is_not_written_as_all():
         assert report.share(part, whole) == words
 
 
-# ---- the page ----
-
-
 SMOOTHING = {"prior": {"kind": "gaussian", "scale": dict.fromkeys(NAMES, 0.05)}, "rounds": 3, "settled": False}
 ROUNDS = "(gaussian, of the bounds: 0.05), in 3 rounds; "
 
@@ -222,9 +216,6 @@ def test_the_command_writes_the_page_beside_the_store_or_says_why_not(tmp_path, 
         ("other.zarr", "is no store of a fitted map"),
     ):
         assert message in refused(["report", *words.split()], capsys, tmp_path)
-
-
-# ---- pictures ----
 
 
 def test_an_image_is_the_map_with_row_0_on_top_in_colours_over_the_middle():

@@ -76,7 +76,7 @@ def test_wrong_models_need_a_discrepancy() -> None:
     assert np.mean([one.elpd - other.elpd for one, other in zip(with_it, alone, strict=True)]) > 1.0
 
 
-def test_quantiles_are_those_of_the_draws() -> None:
+def test_quantiles_are_those_of_the_draws_and_hold_what_they_say() -> None:
     fitted, held_out = split(measurements(3, 0.1))
     at = predict(fitted_to(fitted), held_out)
     assert not np.array_equal(at.mean, at.latent.mean)
@@ -91,27 +91,14 @@ def test_quantiles_are_those_of_the_draws() -> None:
     expected = np.mean((held_out.used().values > low) & (held_out.used().values < high))
     assert at.scores.coverage[0.95] == pytest.approx(expected)
     assert at.scores == scores(at, held_out)
-
-
-def test_thirty_held_out_measurements_lie_within_what_is_predicted_and_not_within_the_stack() -> None:
-    """The 95 % of a stack that is wrong by 10 % held 18 of 30; those of the BSDF with its discrepancy, which `mean`,
-    `sd` and `quantile` give, and those of a measurement hold what they say."""
-    fitted, held_out = split(measurements(3, 0.1))
-    thirty = np.zeros(len(held_out), bool)
-    thirty[np.flatnonzero(held_out.mask)[np.linspace(0, 81, 30).astype(int)]] = True
-    held_out = held_out.where(thirty)
-    noise = Noise(relative=SIGMA, floor=1e-4, discrepancy=True)
-    at = predict(fit(STACK, fitted, transport=line, noise=noise, starts=2), held_out)
-    values = held_out.used().values
-    assert len(values) == 30
-
-    def inside(low: np.ndarray, high: np.ndarray) -> int:
-        return int(np.sum((low < values) & (values < high)))
-
-    assert inside(*at.latent.quantiles[[0, -1]]) <= 18
-    assert inside(at.quantile(0.025), at.quantile(0.975)) >= 27
-    assert inside(*at.predictive.quantiles[[0, -1]]) >= 27
-    assert at.scores.coverage[0.95] >= 27 / 30
+    # of a stack that is wrong by 10 %: its own interval holds few, that of the BSDF and its discrepancy what it says
+    within = [
+        np.mean((low < held_out.used().values) & (held_out.used().values < high))
+        for low, high in (at.latent.quantiles[[0, -1]], (at.quantile(0.025), at.quantile(0.975)))
+    ]
+    assert within[0] < 0.6
+    assert within[1] > 0.9
+    assert expected > 0.9
 
 
 @pytest.mark.slow

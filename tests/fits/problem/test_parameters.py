@@ -127,8 +127,6 @@ def test_a_stack_is_split_and_filled_by_name() -> None:
     np.testing.assert_array_equal(stack.base.albedo, [0.5, 0.6, 0.7])
 
 
-# ---- channels that a power law or a random walk ties ----
-
 GEOMETRY = fits.slices(incidence=(10.0, 50.0), outgoing=np.arange(-70.0, 71.0, 10.0))
 NOISE = fits.Noise(relative=0.02, floor=1e-6, discrepancy=False)
 SINGLE = lj.SingleScattering()

@@ -25,9 +25,6 @@ PAINT = lj.Stack([], lj.Lambertian(Free(0.4, 0.0, 1.0)))
 DATA = simulate(lj.Stack([], lj.Lambertian(0.6)), slices(incidence=[20], outgoing=[-40, 10, 70]), noise=0.1)
 
 
-# ---- noise ----
-
-
 @pytest.mark.parametrize("z", [0.0, 1e-12, -1e-5, 0.019, 0.0201, -0.3, 2.0, 40.0, 1e6])
 def test_densities_are_scipys_and_half_squares_of_residuals(z: float) -> None:
     for tails, reference in TAILS.items():
@@ -125,9 +122,6 @@ def test_named_residuals() -> None:
         np.testing.assert_allclose(ours, reference, atol=0.011 if name == "cube_root" else 1e-12)
         slope = jax.jacfwd(lambda f, name=name: named_residual(name, f, jnp.asarray(values), jnp.asarray(cosine)))
         assert np.all(np.isfinite(slope(jnp.asarray(predicted))))
-
-
-# ---- what stands for a transport, and what follows from a problem ----
 
 
 def lambert(stack: lj.Stack, wi: jax.Array, wo: jax.Array, gain: float = 1.0) -> jax.Array:
