@@ -14,9 +14,7 @@ import pytest
 
 import fits
 import layerjax as lj
-from fits.data.geometry import Geometry
-from fits.maps.options import MapOptions
-from fits.maps.store import FittedMap
+from fits import FittedMap, Geometry, MapOptions
 from tests.helpers.files import contents
 
 TRANSPORT, NOISE = lj.SingleScattering(), fits.Noise(relative=0.02)

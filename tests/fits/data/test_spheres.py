@@ -114,7 +114,6 @@ def test_coefficients_are_recovered_through_spheres() -> None:
         (lambda: Sphere(0.0, 0.0), "Sphere.diameter is 0.0, must be a number in"),
         (lambda: Sphere(100.0, 99.999, 95.0, 95.0), "the ports cover the whole wall"),
         (lambda: Sphere(100.0, 10.0, wall=1.0), r"Sphere.wall is 1.0, must be a number in \[0, 1\)"),
-        (lambda: Sphere(100.0, 10.0, detector_reflectance=-0.1), "Sphere.detector_reflectance is -0.1"),
         (lambda: Spheres(FRONT, standard=0.0), r"Spheres.standard is 0.0, must be in \(0, 1\]"),
         (lambda: Spheres(FRONT, together=True), "Spheres.together: there is only one sphere"),
     ],

@@ -273,13 +273,10 @@ PAINT = lj.Stack([], lj.Lambertian(Free(0.5, 0.0, 1.0)))
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda: fit(LINE, line_data(), transport=line, starts=0), "starts: 0 is not a whole number of at least 1"),
-        (lambda: fit(LINE, transport=line), "data: None is not a Measurements"),
         (lambda: Problem(PAINT, line_data(), lj.RandomWalk()), "RandomWalk is random; use a deterministic one"),
         (lambda: simulate(PAINT, slices(), lj.RandomWalk()), "RandomWalk is random"),
         (lambda: Problem(PAINT, line_data(), lj.AddingDoubling(tolerance=0.01)), "0.01 needs concrete parameters"),
         (lambda: FitOptions(same_cost=0.0), r"FitOptions.same_cost is 0.0; it must be a number in \(0, inf\)"),
-        (lambda: FitOptions(numerical_error="small"), r"FitOptions.numerical_error is 'small'; it must be a number"),
         (lambda: options_from({"tolerance": 1.0}), r"\[options\] has an unknown key 'tolerance'; it must be one of"),
     ],
 )

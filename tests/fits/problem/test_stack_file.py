@@ -7,10 +7,8 @@ import numpy as np
 import pytest
 
 import layerjax as lj
+from fits import Discrepancy, Instrument, Noise
 from fits.optimise.options import FitOptions, options_from
-from fits.problem.discrepancy import Discrepancy
-from fits.problem.instrument import Instrument
-from fits.problem.noise import Noise
 from fits.problem.parameters import Box, Free, LogNormal, LogUniform, Normal, PowerLaw, is_free
 from fits.problem.stack_file import material_to_dict, read_instrument, read_problem, stack_from_dict, write_problem
 from tests.helpers import places
