@@ -58,20 +58,11 @@ TURNED = np.abs(np.sin(np.radians(DATA.phi_o))) > 0.1
 
 
 @pytest.mark.parametrize(
-    ("words", "expected"),
+    ("given", "expected"),
     [
         ("incidence=10,50.2", np.abs(DATA.theta_i - 30.0) > 0.1),
         ("theta_o=20:40", (DATA.theta_o > 19.9) & (DATA.theta_o < 40.1)),
         ("azimuth=60", TURNED),
-    ],
-)
-def test_words_select(words, expected):
-    np.testing.assert_array_equal(select(DATA, words), expected)
-
-
-@pytest.mark.parametrize(
-    ("given", "expected"),
-    [
         ({"incidence": [10, 50.2]}, np.abs(DATA.theta_i - 30.0) > 0.1),
         ({"azimuth": 60}, TURNED),
         ({"azimuth": -120}, TURNED),
@@ -83,7 +74,10 @@ def test_words_select(words, expected):
         ),
     ],
 )
-def test_arguments_select_and_drop_omits_the_same(given, expected):
+def test_words_and_arguments_select_and_drop_omits_the_same(given, expected):
+    if isinstance(given, str):
+        np.testing.assert_array_equal(select(DATA, given), expected)
+        return
     data = DATA.where(DATA.theta_o < 79.0)
     for part, which in ((data.select(**given), expected), (data.drop(**given), ~expected)):
         np.testing.assert_array_equal(part.wo, data.wo[which & data.mask])

@@ -14,7 +14,7 @@ import layerjax as lj
 from fits.cli.parser import main
 from fits.exports.openpbr import surface as model
 from fits.exports.openpbr.document import inputs
-from fits.exports.openpbr.surface import EDGE, Surface, metal_reflectance
+from fits.exports.openpbr.surface import Surface
 from tests.helpers.commands import refused
 
 evaluate, albedo = eqx.filter_jit(model.evaluate), eqx.filter_jit(model.albedo)
@@ -102,11 +102,6 @@ def test_known_limits():
     for surface, apart in ((Surface(("diffuse",), RED, 0.5), False), (Surface(("gloss", "diffuse"), RED), True)):
         most = np.max(abs(evaluate(surface, wi, wo) / evaluate(surface, wo, wi) - 1.0))
         assert most > 0.01 if apart else most < 1e-12
-    # a metal has its colours at 0 and 82 degrees
-    color, tint = jnp.array([0.9, 0.5]), jnp.array([0.8, 0.6])
-    np.testing.assert_allclose(metal_reflectance(jnp.ones(1), color, tint), color)
-    schlick = color + (1.0 - color) * (1.0 - EDGE) ** 5
-    np.testing.assert_allclose(metal_reflectance(jnp.array([EDGE]), color, tint), tint * schlick)
 
 
 def read(path):

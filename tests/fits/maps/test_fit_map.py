@@ -12,7 +12,6 @@ from scipy.optimize import least_squares
 
 import fits
 import layerjax as lj
-from fits.maps.fit_map import tile
 from fits.maps.report import summarise, verdict
 from tests.helpers import quick_maps
 from tests.helpers.quick_maps import FREE, NAMES, NOISE, TRANSPORT, assert_same, fitted
@@ -126,13 +125,6 @@ def test_thresholds_of_flags_are_options(tmp_path, measured):
     map = fitted(tmp_path / "map.zarr", measured, **thresholds, restarts=0)
     assert 0.2 < map.has("poor").sum() / map.has("fitted").sum() < 0.8
     assert (map.option("poor_probability"), map.option("numerical_error")) == (0.5, fits.MapOptions.numerical_error)
-
-
-def test_chunks_are_as_square_as_the_map_allows():
-    assert tile((512, 512), 1024) == (32, 32)
-    assert tile((100,), 1024) == (100,)
-    assert tile((3, 5000), 1024) == (3, 341)
-    assert tile((4, 8, 8), 16) == (1, 4, 4)
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,7 @@ from scipy import stats
 from fits import Fit, Free, SamplerOptions, fit, sample
 from fits.sampling.sample import load, settings
 from fits.store import Store
-from tests.helpers.models import COUNT, design, line, line_data, line_fit, measured, student_fit
+from tests.helpers.models import COUNT, design, line, line_data, line_fit, student_fit
 from tests.helpers.places import ROOT
 
 
@@ -103,33 +103,6 @@ def test_a_parameter_on_its_bound_has_a_truncated_posterior() -> None:
     # the fourth moment of an exponential is three times that of a Gaussian
     assert deviation == pytest.approx(law.std(), rel=2 * error)
     assert [median, lower, upper] == pytest.approx(law.ppf([0.5, 0.158655, 0.841345]), abs=2 * error * law.std())
-
-
-@pytest.mark.slow
-def test_parameters_tied_together_on_one_bound() -> None:
-    """Two parameters at a bound, both traded against a third: mean and deviation by brute force."""
-    x = design(COUNT)[:, 1:]
-    stack = {"a": Free(0.9, -1.0, 3.0), "b": Free(0.5, 0.0, 0.5), "c": Free(0.5, 0.0, 0.5)}
-
-    def steep(stack, wi, wo):
-        return (stack["a"] + (stack["b"] + stack["c"]) * wo[:, 2])[:, None]
-
-    noise = 0.02 * np.random.default_rng(3).standard_normal((COUNT, 1))
-    fitted = fit(stack, measured(1.0 + 1.01 * x + noise, 0.02), transport=steep, starts=4)
-    posterior = sample(fitted, walkers=16, seed=5)
-    assert posterior.converged
-    assert len(posterior.chain) < 3000
-    # the same posterior by brute force: weights of uniform draws of b and c, with a integrated in closed form
-    generator = np.random.default_rng(0)
-    b, c = generator.uniform(0.3, 0.5, (2, 200_000))
-    rest = fitted.problem.data.values - (b + c) * x
-    weights = np.exp(-0.5 * (COUNT * np.var(rest, axis=0) - np.min(COUNT * np.var(rest, axis=0))) / 0.02**2)
-    mean = np.average(b, weights=weights)
-    spread = np.sqrt(np.average((b - mean) ** 2, weights=weights))
-    _, _, _, average, deviation = posterior.summary()["['b']"]
-    error = 5 / np.sqrt(posterior.effective_samples.min())
-    assert average == pytest.approx(mean, abs=error * spread)
-    assert deviation == pytest.approx(spread, rel=2 * error)
 
 
 def test_a_short_chain_reports_nothing_unless_told_to(result: Fit, tmp_path: Path) -> None:
