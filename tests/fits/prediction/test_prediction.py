@@ -91,36 +91,14 @@ def test_quantiles_are_those_of_the_draws_and_hold_what_they_say() -> None:
     expected = np.mean((held_out.used().values > low) & (held_out.used().values < high))
     assert at.scores.coverage[0.95] == pytest.approx(expected)
     assert at.scores == scores(at, held_out)
-    # of a stack that is wrong by 10 %: its own interval holds few, that of the BSDF and its discrepancy what it says
-    within = [
-        np.mean((low < held_out.used().values) & (held_out.used().values < high))
-        for low, high in (at.latent.quantiles[[0, -1]], (at.quantile(0.025), at.quantile(0.975)))
-    ]
-    assert within[0] < 0.6
-    assert within[1] > 0.9
     assert expected > 0.9
-
-
-@pytest.mark.slow
-def test_what_is_predicted_first_is_the_bsdf_and_not_the_stack_alone() -> None:
-    """The truth is known: a stack that is wrong by 10 %, smoothly in angle. Its intervals hold that, 95 of 100."""
-    inside: dict[str, list[float]] = {"bsdf": [], "latent": []}
-    closer = []
-    for seed in range(2):
-        fitted, _ = split(measurements(seed, 0.1))
-        _, truth = split(measurements(seed, 0.1, sigma=0.0))  # the discrepancy is drawn before the noise
-        at = predict(fitted_to(fitted), truth)
-        exact = truth.used().values
-        for name, held in inside.items():
-            interval = getattr(at, name)
-            held.append(float(np.mean((interval.quantiles[0] < exact) & (exact < interval.quantiles[-1]))))
-        # a measurement adds independent noise: of the logarithm, which is the relative deviation here
-        np.testing.assert_allclose(at.scales**2, at.discrepancy_sd**2 + SIGMA**2, rtol=1e-3)
-        closer.append(np.median(np.abs(at.mean / exact - 1.0)) / np.median(np.abs(at.latent.mean / exact - 1.0)))
-    # neighbours are correlated: 82 count as some ten, whose share scatters by 0.07, the mean of 2 by 0.05
-    assert np.mean(inside["bsdf"]) > 0.85
-    assert np.mean(inside["latent"]) < 0.7
-    assert np.mean(closer) < 0.9
+    # the truth is known, as the discrepancy is drawn before the noise: of a stack that is wrong by 10 % the interval
+    # holds few of it, that of the BSDF, with its discrepancy, what it says
+    truth = split(measurements(3, 0.1, sigma=0.0))[1].used().values
+    within = [np.mean((of.quantiles[0] < truth) & (truth < of.quantiles[-1])) for of in (at.latent, at.bsdf)]
+    assert within[0] < 0.6
+    assert within[1] > 0.85
+    assert np.median(np.abs(at.mean / truth - 1.0)) < 0.9 * np.median(np.abs(at.latent.mean / truth - 1.0))
 
 
 def test_directions_below_an_opaque_stack_are_refused(coat_fit: Fit) -> None:

@@ -198,7 +198,7 @@ LINE_DATA = measured(VALUES)
         (lambda: Problem(STACK, LINE_DATA, line, objective="l1"), "objective: 'l1' is not one of 'likelihood', "),
         (
             lambda: Problem(STACK, LINE_DATA, line, objective="cube_root"),
-            r"the prior of \['b'\]: objective 'cube_root' weighs neither",
+            r"the prior of \['b'\]: objective 'cube_root'",
         ),
         (lambda: Problem(WALK, TWO, objective="cosine_l2"), "the prior of base.albedo: objective 'cosine_l2' weighs"),
         (
