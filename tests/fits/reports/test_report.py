@@ -11,14 +11,9 @@ import pytest
 from matplotlib.figure import Figure
 
 import layerjax as lj
-from fits.any_report import report
-from fits.data.geometry import slices
-from fits.data.measurements import Measurements, Source
+from fits import Fit, Free, Measurements, Noise, fit, report, slices
+from fits.data.measurements import Source
 from fits.data.scans import in_plane, signed_angle
-from fits.optimise.fit import fit
-from fits.optimise.result import Fit
-from fits.problem.noise import Noise
-from fits.problem.parameters import Free
 from fits.reports import tables
 from fits.reports.html import FitReport
 from fits.reports.plots import data as pictures
