@@ -56,7 +56,6 @@ def test_coordinates(reading, coordinates):
 
 @pytest.mark.parametrize("coordinates", ["RUSIN_TH_TD", "COS_TH"])
 def test_half_angles_alone(reading, coordinates):
-    """The angle between half vector and normal is that of the file, and that between half vector and light."""
     angles = RANDOM.uniform(0.05, 0.6, (20, 1 if coordinates == "COS_TH" else 2))
     numbers = np.cos(angles) if coordinates.startswith("COS") else angles
     data = reading(alta(coordinates, np.hstack([numbers, np.ones((20, 1))])))

@@ -63,7 +63,6 @@ def test_repeats_tell_the_noise() -> None:
 
 
 def test_the_shipped_coatings_are_reciprocal_and_dark() -> None:
-    """Their own README: reciprocal to some percent, reflectances of 0.06 to 0.10."""
     steel = fits.read(COATINGS / "nite_on_blasted_steel1008_650nm_hemisphere.csv")
     assert 0.01 < reciprocity(steel).median < 0.05
     assert all(0.06 < one.share[0] / one.covered < 0.11 for one in energies(steel))

@@ -38,7 +38,6 @@ def test_rows_of_one_incidence() -> None:
 
 @pytest.mark.parametrize("given", [0.0, 0.8])
 def test_the_correlation_of_neighbours_is_recovered(given: float) -> None:
-    """Of a stationary autoregressive series, in any order of the rows."""
     count = 4000
     draws = np.random.default_rng(5).standard_normal(count) * np.sqrt(1 - given**2)
     draws[0] /= np.sqrt(1 - given**2)

@@ -89,7 +89,6 @@ def test_the_disk_has_the_area_of_the_square():
 
 
 def test_an_isotropic_tree_by_hand(reading):
-    """In eight boxes: light at sin theta 0.5; the upper half of the first axis is empty."""
     data = reading(xml(3, ("{ {1} {0} {3} {0} {5} {0} {7} {0} }", {})))
     np.testing.assert_allclose(data.theta_i, 30.0)
     np.testing.assert_allclose(data.phi_i, 180.0)

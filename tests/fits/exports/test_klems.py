@@ -101,7 +101,6 @@ def test_what_is_written_is_read(tmp_path):
 
 
 def test_axes_are_not_turned(sheet_file):
-    """Fibers that lean: of every other orientation the readings would be another material's."""
     data = fits.read(sheet_file).used()
     steep = (abs(data.wi[:, 2]) > 0.5) & (abs(data.wo[:, 2]) > 0.5)
 

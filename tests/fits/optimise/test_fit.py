@@ -36,7 +36,6 @@ def lobe_fit():
 
 
 def test_the_lobe_fit_is_scipys(lobe_fit):
-    """Same minimum and same J'J as scipy's finite-difference solver: to 1e-3 of the errors, and 1e-3 in them."""
     data, names = noisy_lobe(0), [name.strip("[']") for name in lobe_fit.problem.names]
 
     def residuals(vector):
@@ -239,7 +238,6 @@ def test_starts_that_fail_are_counted_and_not_believed():
 
 
 def test_a_medium_over_a_base_is_recovered():
-    """In two channels, from simulated slices."""
 
     def stack(thickness, albedo, g, base):
         return lj.Stack([lj.Medium(thickness, albedo, lj.HenyeyGreenstein(g))], lj.Lambertian(base))

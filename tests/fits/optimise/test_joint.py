@@ -128,7 +128,6 @@ def test_the_posterior_is_that_of_all(joint):
 
 
 def test_measurements_that_share_nothing_are_each_alone():
-    """One with levels of noise that are fitted, one with errors that readings share."""
     values = design(60) @ [0.9, 0.4]
     noise = np.random.default_rng(3).standard_normal((2, 60)) * [[0.03], [0.05]]
     level, shared = (measured((values * (1 + part))[:, None]) for part in noise)

@@ -72,7 +72,6 @@ def test_the_lowest_end_is_the_fit_though_it_ran_out_of_steps(monkeypatch):
 
 
 def test_a_start_that_ran_out_of_steps_goes_on(monkeypatch):
-    """Two steps a round, and as many rounds as it takes: the same minimum."""
     monkeypatch.setattr(starts_module, "MOST_STEPS", 2)
     monkeypatch.setattr(starts_module, "MOST_ROUNDS", 200)
     slowly = fit(LOBE_STACK, noisy_lobe(0), transport=lambda *a: lobe(*a), starts=1)

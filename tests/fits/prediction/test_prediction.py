@@ -102,7 +102,6 @@ def test_quantiles_are_those_of_the_draws_and_hold_what_they_say() -> None:
 
 
 def test_directions_below_an_opaque_stack_are_refused(coat_fit: Fit) -> None:
-    """There is nothing to see: whatever number stands there is made up."""
     for at in (slices([95.0]), slices([90.0]), slices([30.0], [10.0, 120.0])):
         with pytest.raises(ValueError, match=r"sees nothing of an opaque stack; its polar angle must be in \[0, 90\)"):
             predict(coat_fit, at)

@@ -120,7 +120,6 @@ LAW = PowerLaw(Free(4.0, 0.1, 50.0), Free(0.0, -4.0, 4.0), (450.0, 550.0), 600.0
 
 
 def test_dictionary_round_trip():
-    """Numbers in single precision stay short."""
     for stack in (
         lj.Stack([], base=lj.Conductor(ior=[0.2, 0.9, 1.1], k=3.9, alpha=0.1)),
         lj.Stack([], base=lj.VMFDiffuse(Free(0.4, 0.0, [0.8, 0.9, 1.0]), Free(0.3, 0.0, 1.0), form="all_orders")),
@@ -242,7 +241,6 @@ VALUES = {
 
 @pytest.mark.parametrize("name", VALUES)
 def test_any_value_in_any_place(tmp_path: Path, name: str) -> None:
-    """It can be computed with, or one line says where it is."""
     path = tmp_path / "stack.toml"
     for place, text in PLACES.items():
         path.write_text(text.replace("@", VALUES[name]))

@@ -69,7 +69,6 @@ def summed(fitted: Fit) -> tuple[float, ...]:
 
 
 def test_evidence_and_draws_by_weight_are_those_of_all_modes(fitted: Fit, summed: tuple) -> None:
-    """Predictions are made with such draws."""
     *_, share, log_evidence = summed
     found = fits.evidence(fitted)
     assert found.reliable

@@ -207,7 +207,6 @@ def test_inference_data(result: Fit, posterior) -> None:
 
 
 def test_free_student_noise_is_sampled() -> None:
-    """The widest likelihood: the level's posterior agrees with its maximum-likelihood error."""
     summary = sample(fitted := student_fit(), walkers=16, seed=4).summary()
     for name, (median, *_, deviation) in summary.items():
         assert abs(median - fitted.values[name]) < fitted.standard_errors[name]

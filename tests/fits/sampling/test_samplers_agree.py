@@ -45,7 +45,6 @@ def test_quantiles_of_nuts_are_those_of_emcee(plain: Posterior) -> None:
 
 @pytest.mark.parametrize("sampler", get_args(Sampler))
 def test_one_parameter(sampler: Sampler) -> None:
-    """The slope of a line through a known point: mean and deviation in closed form."""
     fitted = fit({"a": 1.0, "b": Free(0.1, -1.0, 3.0)}, line_data(), transport=line, starts=2)
     x = design(COUNT)[:, 1]
     posterior = sample(fitted, sampler=sampler, seed=2)
