@@ -5,7 +5,6 @@ import pytest
 
 import fits
 import layerjax as lj
-from fits.cli.parser import main
 from fits.data.formats.rgl_table import read_table
 from fits.exports import merl
 from fits.exports.contents import pairs
@@ -185,9 +184,8 @@ def test_what_cannot_be_written_is_named(tmp_path, material, name, to, options, 
     assert not list(tmp_path.iterdir())
 
 
-def test_on_the_command_line(work, capsys):
-    assert main(["export", "coat.toml", "--to", "csv", "--out", "coat.csv"]) == 0
-    assert "data points" in capsys.readouterr().out
+def test_on_the_command_line(work, capsys, layerjax):
+    assert "data points" in layerjax("export coat.toml --to csv --out coat.csv").out
     assert len(fits.read(work / "coat.csv")) > 1000
     for words, message in (
         ("coat.toml --to csv --out coat.csv", "exists already"),

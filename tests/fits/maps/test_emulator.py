@@ -10,6 +10,7 @@ import fits
 import layerjax as lj
 from fits.maps.emulator import emulate, with_emulator
 from fits.problem.model import Model
+from tests.helpers.models import along
 
 ERROR = fits.MapOptions.emulator_error
 NOISE = fits.Noise(relative=0.02, floor=1e-4, discrepancy=False)
@@ -27,8 +28,7 @@ def haze(stack, wi, wo):
 def problem_of(transport):
     every = fits.slices(incidence=[10.0, 60.0])
     places = np.linspace(0, len(every.wi) - 1, 12).astype(int)
-    view, values = (every.wi[places], every.wo[places]), np.full((12, 2), 0.1)
-    data = fits.Measurements(*view, values, None, np.ones(12, bool), ("one", "two"))
+    data = along(fits.Geometry(every.wi[places], every.wo[places]), 0.1, channels=("one", "two"))
     return fits.Problem(FREE, data, transport=transport, noise=NOISE, scale=fits.Free(1.0, 0.8, 1.25))
 
 

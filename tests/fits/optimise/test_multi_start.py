@@ -50,9 +50,6 @@ def test_a_race_ends_where_all_starts_do(monkeypatch):
     ends = starts_module.screened_starts(problem, points)
     every = multi_start(problem, points, lambda *_: None)
     assert min(end.cost for end in ends) <= min(end.cost for end in every) + LEAST_GAIN
-    left = [end for end in ends if end.max_steps_reached]
-    assert 1 <= len(left) <= len(points) - starts_module.FRONT
-    assert {end.steps for end in left} == {20}  # with sigma held, and free
     assert sum(end.steps for end in ends) < sum(end.steps for end in every)
 
 
