@@ -6,7 +6,7 @@ import pytest
 from scipy import special
 
 import layerjax as lj
-from fits import Free, Problem, Sphere, Spheres, Totals, fit
+from fits import Free, Problem, Sphere, Spheres, Totals
 from fits.data.spheres import Shares
 
 FRONT = Sphere(100.0, 30.0, 15.0, 10.0, 0.95, 0.1)
@@ -91,21 +91,6 @@ def test_light_from_behind_meets_the_other_face() -> None:
         predicted(layers, Spheres(None, BEHIND)) / predicted(layers, None) for layers in ([grey, white], [white, grey])
     ]
     assert gains[0] > 1.02 * gains[1]
-
-
-@pytest.mark.slow
-def test_coefficients_are_recovered_through_spheres() -> None:
-    spheres = Spheres(FRONT, BEHIND, standard=0.98, together=True)
-    slab = lj.Stack([lj.TurbidMedium(1.0, Free(2.0, 0.1, 50.0), Free(0.5, 1e-3, 5.0), lj.HenyeyGreenstein(0.5))])
-    solver = lj.AddingDoubling(nodes=8, modes=1)
-
-    def totals(values: np.ndarray, seen: Spheres | None) -> Totals:
-        return Totals.of(0.0, reflectance=values[0], transmittance=values[1], sigma=0.001, spheres=seen)
-
-    exact = np.ravel(Problem(slab, totals(np.array([0.2, 0.3]), spheres), solver).predict([5.0, 0.2]))
-    found, blind = (fit(slab, totals(exact, seen), transport=solver, starts=2) for seen in (spheres, None))
-    np.testing.assert_allclose(list(found.values.values()), [5.0, 0.2], rtol=1e-4)
-    assert abs(blind.values["layers[0].mu_a"] / 0.2 - 1.0) > 0.05
 
 
 @pytest.mark.parametrize(

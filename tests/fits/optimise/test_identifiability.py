@@ -100,3 +100,40 @@ def test_parts_of_mixtures_have_limits_of_their_own():
     data = fits.simulate(truth, geometry, SINGLE, 0.01, 1e-4)
     found = fits.fit(lj.Mixture(parts, [0.2, 0.8]), data, transport=SINGLE, starts=4)
     assert list(instrument_limits(found)) == ["smooth.base.alpha"]
+
+
+COPPER = {  # a metal under an absorbing coat; its index at 550 nm
+    "layers[0].ior": (1.5, fits.Free(1.4, 1.2, 2.2)),
+    "layers[0].alpha": (0.1, fits.Free(0.2, 0.02, 0.6)),
+    "layers[1].thickness": (0.3, fits.Free(0.5, 0.01, 3.0)),
+    "base.ior": (0.95, fits.Free(1.0, 0.05, 6.0, fits.LogNormal(1.0, 0.5))),
+    "base.k": (2.6, fits.Free(3.0, 0.5, 10.0, fits.LogNormal(3.0, 0.5))),
+    "base.alpha": (0.3, fits.Free(0.2, 0.02, 0.8)),
+}
+
+
+@pytest.mark.slow  # the derivatives compile for more than a minute
+def test_coated_copper_is_recovered_but_for_what_cannot_be_told_apart():
+    def coat(ior, alpha, thickness, *metal):
+        return lj.Stack([lj.Interface(ior, alpha), lj.Medium(thickness, 0.0)], lj.Conductor(*metal))
+
+    truth, free = zip(*COPPER.values(), strict=True)
+    transport = lj.Statistical(facet_multiple_scattering=False)
+    geometry = fits.slices(incidence=(10, 35, 60), outgoing=np.arange(-80, 81, 10), azimuth=(0, 90))
+    data = fits.simulate(coat(*truth), geometry, transport=transport, noise=0.03, seed=1)
+    found = fits.fit(coat(*free), data, transport=transport, starts=2, seed=0)
+    assert found.converged
+    assert found.at_bound == ()
+    errors = found.standard_errors
+    for name, (value, _) in COPPER.items():  # with a fixed seed: for good
+        assert abs(found.values[name] - value) < 3.0 * errors[name], name
+    for name, within in (("layers[0].ior", 0.01), ("layers[0].alpha", 0.02), ("base.alpha", 0.02)):
+        assert errors[name] < within * COPPER[name][0], name
+    assert abs(found.chi_square - found.degrees_of_freedom) < 3.0 * np.sqrt(2.0 * found.degrees_of_freedom)
+    (direction,) = found.unidentified
+    assert set(direction.weights) == {"base.ior", "base.k", "layers[1].thickness"}
+    assert direction.unconstrained
+    assert all(conditional < 0.05 * errors[name] for name, conditional in direction.conditional_errors.items())
+    sentence = verdicts.verdict(found).sentences[2]
+    assert "are not identified separately" in sentence
+    assert all(name in sentence for name in direction.weights)
