@@ -12,11 +12,9 @@ from fits.optimise.levenberg_marquardt import evaluate_at
 from fits.optimise.multi_start import LEAST_GAIN, multi_start, start_points, starts_store, unit_of
 from fits.optimise.result import OUTCOMES
 from tests.helpers.models import LINE, LOBE, LOBE_STACK, directions, line, line_data, lobe, measured, noisy_lobe
-from tests.helpers.places import EXAMPLES
+from tests.helpers.places import COATINGS, EXAMPLES
 
-COATINGS = EXAMPLES / "arizona_black_coatings"
-
-STEEL = "nite_on_blasted_steel1008_650nm_inplane.csv"
+STEEL = COATINGS / "nite_on_blasted_steel1008_650nm_inplane.csv"
 
 
 def cost_at(problem, values):
@@ -28,7 +26,7 @@ def cost_at(problem, values):
 @pytest.mark.slow
 def test_a_stack_never_ends_above_what_it_contains():
     """A haze over flakes on paint: the flakes on paint, beside steel."""
-    data, ends = read(COATINGS / STEEL).select(incidence=(10.0, 50.0)), {}
+    data, ends = read(STEEL).select(incidence=(10.0, 50.0)), {}
     for name in ("hazy_coat_over_diffuse", "flake_coat_over_diffuse"):
         given = read_problem(EXAMPLES / f"{name}.toml")
         # the cheapest transport: what is asked is about starts, whatever carries the light
@@ -43,7 +41,7 @@ def test_a_stack_never_ends_above_what_it_contains():
 def test_a_race_ends_where_all_starts_do(monkeypatch):
     """Of a stack with several minima; few steps tell which starts go on, and the others are not followed."""
     given = read_problem(EXAMPLES / "hazy_coat_over_diffuse.toml")
-    data = read(COATINGS / STEEL).select(incidence=(10.0, 50.0))
+    data = read(STEEL).select(incidence=(10.0, 50.0))
     problem = Problem(given.stack, data, lj.SingleScattering(), replace(given.noise, discrepancy=False), given.scale)
     points = starts_module.start_points(problem, 8, 0)
     monkeypatch.setattr(starts_module, "EARLY", 10)
@@ -76,20 +74,6 @@ def test_a_start_that_ran_out_of_steps_goes_on(monkeypatch):
     at_once = fit(LOBE_STACK, noisy_lobe(0), transport=lobe, starts=1)
     assert slowly.converged
     assert slowly.minima[0].cost == pytest.approx(at_once.minima[0].cost, abs=LEAST_GAIN)
-
-
-class Dimmed:
-    """A transport that shows as an object in memory."""
-
-    def __call__(self, stack, wi, wo):
-        return 0.5 * line(stack, wi, wo)
-
-
-def test_starts_are_known_again_by_a_process_with_the_transport_elsewhere_in_memory(tmp_path, monkeypatch):
-    transports = Dimmed(), Dimmed()  # both at once, so that they differ in place
-    fit(LINE, line_data(), transport=transports[0], starts=2, checkpoint=tmp_path / "starts")
-    monkeypatch.setattr(starts_module, "rough_descent", None)  # no start is run again
-    fit(LINE, line_data(), transport=transports[1], starts=2, checkpoint=tmp_path / "starts")
 
 
 def test_starts_are_those_of_the_same_fit_only(tmp_path):

@@ -125,21 +125,6 @@ def test_likelihoods_of_all_and_of_each_given_the_others_are_those_of_the_dense_
     np.testing.assert_allclose(np.ravel(found), expected, atol=1e-4)
 
 
-def test_places_are_the_half_vector_and_difference() -> None:
-    for layout, geometry in LAYOUTS.items():
-        expected = folded(problem(layout).data)
-        # at a half vector along the normal, azimuths of the difference are rounding
-        upright = expected[:, 0] < 1e-5
-        found = places(geometry.wi, geometry.wo)
-        np.testing.assert_allclose(found[~upright], expected[~upright], atol=1e-6)
-        np.testing.assert_allclose(np.hypot(*found[upright, 1:3].T), np.hypot(*expected[upright, 1:3].T), atol=1e-6)
-
-        if layout.startswith("two"):  # errors grow by the mean cosine
-            mean_cosine = 0.5 * (geometry.wi[:, 2] + geometry.wo[:, 2])
-            at = Correlation(0.1, 20.0, 20.0, 0.7, 0.0)
-            np.testing.assert_allclose(larger(found, at), mean_cosine**-0.7, rtol=1e-9)
-
-
 def test_light_and_viewer_may_change_places() -> None:
     generator = np.random.default_rng(3)
     wi, wo = (w / np.linalg.norm(w, axis=-1, keepdims=True) for w in generator.standard_normal((2, 200, 3)))
