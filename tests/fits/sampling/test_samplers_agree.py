@@ -7,7 +7,7 @@ import pytest
 
 from fits import Fit, Free, Posterior, fit, sample
 from fits.sampling.sample import Sampler
-from tests.helpers.models import COUNT, LINE, LOBE_STACK, design, line, line_data, lobe, noisy_lobe, student_fit
+from tests.helpers.models import COUNT, LOBE_STACK, design, line, line_data, lobe, noisy_lobe, student_fit
 
 pytest.importorskip("blackjax")
 
@@ -53,13 +53,3 @@ def test_one_parameter(sampler: Sampler) -> None:
     error = 5 / np.sqrt(posterior.effective_samples.min())
     assert average == pytest.approx(mean, abs=error * spread)
     assert deviation == pytest.approx(spread, rel=error)
-
-
-@pytest.mark.parametrize("sampler", ["emcee", pytest.param("nuts", marks=pytest.mark.slow)])
-def test_a_direction_that_is_open_fills_its_box(sampler: Sampler) -> None:
-    fitted = fit({**LINE, "c": Free(0.5, 0.0, 1.0)}, line_data(), transport=line, starts=2)
-    posterior = sample(fitted, sampler=sampler, seed=3)
-    kept = posterior.chain[posterior.burn_in :, :, posterior.names.index("['c']")]
-    error = 5 / np.sqrt(posterior.effective_samples.min())
-    assert kept.mean() == pytest.approx(0.5, abs=error * np.sqrt(1 / 12))
-    assert kept.std() == pytest.approx(np.sqrt(1 / 12), rel=error)
