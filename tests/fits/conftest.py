@@ -1,17 +1,14 @@
 """One small fit of simulated data that the tests of results, reports and the command line share."""
 
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 import layerjax as lj
-from fits.data.formats.csv import write_csv
-from fits.data.geometry import slices
-from fits.data.measurements import Measurements
-from fits.optimise.fit import fit
-from fits.optimise.result import Fit
-from fits.problem.simulate import simulate
-from fits.problem.stack_file import read_problem
+from fits import Fit, Measurements, fit, read_problem, simulate, slices, write_csv
+from fits.cli.parser import main
 from tests.helpers.models import line_fit
 
 TRUE_ALBEDO, TRUE_THICKNESS = 0.4, 0.6
@@ -55,6 +52,18 @@ def work(tmp_path: Path, coat_data: Measurements, coat_toml: Path, monkeypatch: 
     (tmp_path / "coat.toml").write_text(coat_toml.read_text())
     monkeypatch.chdir(tmp_path)
     return tmp_path
+
+
+@pytest.fixture
+def layerjax(capsys: pytest.CaptureFixture[str]) -> Callable[..., Any]:
+    """What a command prints, to `out` and `err`, that ends with this code."""
+
+    def run(words: str, code: int = 0) -> Any:
+        capsys.readouterr()
+        assert main(words.split()) == code
+        return capsys.readouterr()
+
+    return run
 
 
 @pytest.fixture(scope="session")

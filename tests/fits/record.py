@@ -27,13 +27,12 @@ RECORD = ROOT / "tests" / "data" / "record.json"
 EXAMPLES = ROOT / "examples"
 COATINGS = EXAMPLES / "arizona_black_coatings"
 STARTS = 4
+COATED = lj.Stack([lj.Interface(1.5, 0.2)], lj.Lambertian(0.4))
+GEOMETRY = fits.slices(incidence=(10.0, 40.0, 70.0), outgoing=np.arange(-80.0, 81.0, 10.0))
 
 COST, ERRORS, VALUES, QUANTILES, ELPD = 1e-6, 1e-3, 0.01, 0.1, 0.01
 """Relative difference of costs and of standard errors; difference of values in standard errors, of quantiles in
 posterior standard deviations, of elpd differences in their standard errors."""
-
-
-# ---- what is read from a result: the only places that know its attributes ----
 
 
 def of_fit(fit: Any) -> dict[str, Any]:
@@ -90,31 +89,16 @@ def of_map(fitted: Any) -> dict[str, Any]:
 def of_posterior(posterior: Any) -> dict[str, Any]:
     """Quantiles of every parameter."""
     quantiles = np.quantile(posterior.samples, (0.05, 0.5, 0.95), axis=0).T.tolist()
-    sds = posterior.samples.std(axis=0).tolist()
-    return {
-        "quantiles": dict(zip(posterior.names, quantiles, strict=True)),
-        "sd": dict(zip(posterior.names, sds, strict=True)),
-    }
+    columns = {"quantiles": quantiles, "sd": posterior.samples.std(axis=0).tolist()}
+    return {name: dict(zip(posterior.names, column, strict=True)) for name, column in columns.items()}
 
 
-# ---- the cases ----
-
-
-def example(name: str, data: Path, incidence: tuple[float, ...] | None = None, **options: Any) -> Any:
+def example(name: str, data: Path, incidence: tuple[float, ...] | None = None) -> Any:
     """The fit of a stack file of `examples` to a file of data."""
-    problem = fits.read_problem(EXAMPLES / f"{name}.toml")
-    measured = fits.read(data)
-    if incidence is not None:
-        measured = measured.select(incidence=incidence)
-    return fits.fit(
-        problem.stack,
-        measured,
-        transport=problem.transport,
-        noise=problem.noise,
-        scale=problem.scale,
-        starts=STARTS,
-        **options,
-    )
+    problem, measured = fits.read_problem(EXAMPLES / f"{name}.toml"), fits.read(data)
+    measured = measured if incidence is None else measured.select(incidence=incidence)
+    given = {name: getattr(problem, name) for name in ("transport", "noise", "scale")}
+    return fits.fit(problem.stack, measured, starts=STARTS, **given)
 
 
 def held_out() -> dict[str, Any]:
@@ -175,12 +159,9 @@ def structures() -> dict[str, Any]:
     """A search among a few structures on simulated data."""
     from benchmarks.studies.structures import LIBRARY, TRANSPORT
 
-    truth = lj.Stack([lj.Interface(1.5, 0.2)], lj.Lambertian(0.4))
-    geometry = fits.slices(incidence=(10.0, 40.0, 70.0), outgoing=np.arange(-80.0, 81.0, 10.0))
-    data = fits.simulate(truth, geometry, transport=TRANSPORT, noise=0.02, seed=0)
-    return of_search(
-        fits.search(data, LIBRARY, transport=TRANSPORT, options=fits.SearchOptions(layers=1, starts=STARTS))
-    )
+    data = fits.simulate(COATED, GEOMETRY, transport=TRANSPORT, noise=0.02, seed=0)
+    options = fits.SearchOptions(layers=1, starts=STARTS)
+    return of_search(fits.search(data, LIBRARY, transport=TRANSPORT, options=options))
 
 
 def compared() -> dict[str, Any]:
@@ -192,10 +173,8 @@ def compared() -> dict[str, Any]:
 
 def posterior() -> dict[str, Any]:
     """A posterior of two parameters and a scale."""
-    truth = lj.Stack([lj.Interface(1.5, 0.2)], lj.Lambertian(0.4))
     free = lj.Stack([lj.Interface(fits.Free(1.4, 1.2, 2.2), fits.Free(0.3, 0.02, 1.0))], lj.Lambertian(0.4))
-    geometry = fits.slices(incidence=(10.0, 40.0, 70.0), outgoing=np.arange(-80.0, 81.0, 10.0))
-    data = fits.simulate(truth, geometry, transport=lj.Statistical(), noise=0.05, seed=0)
+    data = fits.simulate(COATED, GEOMETRY, transport=lj.Statistical(), noise=0.05, seed=0)
     fit = fits.fit(free, data, transport=lj.Statistical(), noise=fits.Noise(relative=0.05), starts=STARTS)
     return of_fit(fit) | of_posterior(fits.sample(fit, ess=2000))
 
@@ -209,7 +188,6 @@ DATA = {
     "nite_lighttools": "AnoBlackNiTEonSteel.txt",
 }
 STACKS = sorted(path.stem for path in EXAMPLES.glob("*.toml"))
-
 CASES: dict[str, Callable[[], dict[str, Any]]] = {
     **{f"nite-{stack}": lambda stack=stack: of_fit(example(stack, COATINGS / DATA["nite"])) for stack in STACKS},
     **{
@@ -228,17 +206,17 @@ CASES: dict[str, Callable[[], dict[str, Any]]] = {
 }
 
 
-# ---- comparing ----
-
-
-RELATIVE = {"cost": COST, "reduced_chi_square": COST, "prediction": ERRORS, "standard_errors": ERRORS, "errors": ERRORS}
-RELATIVE["bic"] = COST
+LIMITS = dict.fromkeys(("cost", "reduced_chi_square", "bic"), COST)
+LIMITS |= dict.fromkeys(("prediction", "standard_errors", "errors"), ERRORS)
+LIMITS |= {"values": VALUES, "quantiles": QUANTILES, "elpd_diff": ELPD, "weight": ELPD}
 
 
 def differences(name: str, stored: dict[str, Any], found: dict[str, Any]) -> list[str]:
     """Sentences on what differs by more than the stated tolerances."""
     said: list[str] = []
-    errors = stored.get("standard_errors", stored.get("errors", {}))
+    score = {one: max(error, 1.0) for one, error in stored.get("dse", {}).items()}
+    units = {"values": stored.get("standard_errors", stored.get("errors")), "quantiles": stored.get("sd")}
+    units |= {"elpd_diff": score, "weight": score}
 
     def compare(key: str, old: Any, new: Any, tolerance: float, unit: Any = None) -> None:
         if isinstance(old, dict):
@@ -258,17 +236,10 @@ def differences(name: str, stored: dict[str, Any], found: dict[str, Any]) -> lis
             said.append(f"{name}: {key}: {new.flat[worst]:.8g}, was {old.flat[worst]:.8g}, off {off.flat[worst]:.2g}")
 
     for key, old in stored.items():
-        new = found[key]
-        if key in RELATIVE:
-            compare(key, old, new, RELATIVE[key])
-        elif key == "values":
-            compare(key, old, new, VALUES, errors)
-        elif key == "quantiles":
-            compare(key, old, new, QUANTILES, stored["sd"])
-        elif key in ("elpd_diff", "weight"):
-            compare(key, old, new, ELPD, {one: max(error, 1.0) for one, error in stored["dse"].items()})
-        elif key not in ("dse", "sd") and old != new:
-            said.append(f"{name}: {key}: {new}, was {old}")
+        if key in LIMITS:
+            compare(key, old, found[key], LIMITS[key], units.get(key))
+        elif key not in ("dse", "sd") and old != found[key]:
+            said.append(f"{name}: {key}: {found[key]}, was {old}")
     return said
 
 

@@ -3,9 +3,7 @@
 from pathlib import Path
 
 import layerjax as lj
-from fits.data.formats.csv import write_csv
-from fits.data.geometry import slices
-from fits.problem.simulate import simulate
+from fits import simulate, slices, write_csv
 
 BASE = """
 [base]

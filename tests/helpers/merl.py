@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from fits.data.geometry import direction
 
@@ -15,6 +16,14 @@ def smooth_bsdf(theta_h, theta_d, phi_d):
     lobe = 0.1 + 2 * np.cos(theta_h) ** 6
     colour = [1 + 0.5 * theta_d, np.cos(theta_d) ** 2 + 0.3, 1 + 0.2 * np.sin(theta_d) ** 2 * np.cos(2 * phi_d + 0.4)]
     return np.stack([lobe * factor * np.ones_like(phi_d) for factor in colour])
+
+
+def half_angles(wi, wo):
+    """Half and difference angles (theta_h, phi_h, theta_d, phi_d), (4, N), by turning the half vector to the pole."""
+    half = (wi + wo) / np.linalg.norm(wi + wo, axis=1, keepdims=True)
+    theta, phi = np.arccos(np.clip(half[:, 2], -1, 1)), np.arctan2(half[:, 1], half[:, 0])
+    x, y, z = Rotation.from_euler("zy", np.stack([-phi, -theta], axis=1)).apply(np.array(wi)).T
+    return np.array([theta, phi, np.arccos(np.clip(z, -1, 1)), np.arctan2(y, x)])
 
 
 def centre_angles():

@@ -7,13 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
+from fits import Fit, Free, Measurements, Noise, Problem, fit
 from fits.data.geometry import Pairs
-from fits.data.measurements import Measurements
-from fits.optimise.fit import fit
-from fits.optimise.result import Fit
-from fits.problem.noise import Noise
-from fits.problem.parameters import Free
-from fits.problem.problem import Problem
 
 
 def directions(count: int, seed: int, lowest_cosine: float = 0.2) -> np.ndarray:

@@ -8,9 +8,7 @@ from fits.maps.store import FLAGS, FittedMap, blocks_of, create, open_map
 
 NAMES = ("layers[0].thickness", "layers[0].phase.alpha", "base.albedo")
 UNITS = dict(zip(NAMES, ("optical depth", "1", "1"), strict=True))
-FREEDOM = 61
-"""Degrees of freedom: 64 measurements less the parameters."""
-
+FREEDOM = 61  # degrees of freedom: 64 measurements less the parameters
 GOOD = FLAGS["fitted"] | FLAGS["converged"]
 ATTRIBUTES = {
     "version": "0.2.0",

@@ -14,9 +14,7 @@ import pytest
 
 import fits
 import layerjax as lj
-from fits.data.geometry import Geometry
-from fits.maps.options import MapOptions
-from fits.maps.store import FittedMap
+from fits import FittedMap, Geometry, MapOptions
 from tests.helpers.files import contents
 
 TRANSPORT, NOISE = lj.SingleScattering(), fits.Noise(relative=0.02)
@@ -54,18 +52,13 @@ def truth(shape: tuple[int, ...]) -> np.ndarray:
     return np.stack([0.2 + 0.8 * along, 0.8 - 0.6 * along], axis=-1)
 
 
-def exact(numbers: np.ndarray, view: Geometry) -> np.ndarray:
-    """Values of texels with these numbers (..., 2): (..., N, 1)."""
+def seen(numbers: np.ndarray, view: Geometry, seed: int = 0) -> np.ndarray:
+    """Values of texels with these numbers (..., 2), with noise: (..., N, 1)."""
 
     def one(pair):
         return lj.evaluate(coat(*pair), jnp.asarray(view.wi), jnp.asarray(view.wo), transport=TRANSPORT)
 
-    return np.asarray(jax.jit(jax.vmap(one))(numbers.reshape(-1, 2))).reshape(*numbers.shape[:-1], -1, 1)
-
-
-def seen(numbers: np.ndarray, view: Geometry, seed: int = 0) -> np.ndarray:
-    """The same with noise."""
-    values = exact(numbers, view)
+    values = np.asarray(jax.jit(jax.vmap(one))(numbers.reshape(-1, 2))).reshape(*numbers.shape[:-1], -1, 1)
     return values * (1.0 + NOISE.relative * np.random.default_rng(seed).standard_normal(values.shape))
 
 

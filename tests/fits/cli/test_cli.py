@@ -8,20 +8,17 @@ import subprocess
 import sys
 import warnings
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 import layerjax as lj
+from fits import Problem, load_fit, load_posterior, read, save_fit
 from fits.cli import commands
 from fits.cli.arguments import COMMANDS
 from fits.cli.parser import main
-from fits.data.reading import read
 from fits.engines import run
-from fits.problem.problem import Problem
 from fits.reports.html import FitReport
-from fits.reports.results import load_fit, load_posterior, save_fit
 from tests.helpers import tasks
 from tests.helpers.coats import make_folder
 from tests.helpers.commands import refused
@@ -30,10 +27,9 @@ from tests.helpers.places import ROOT
 TRUE = {"layers[0].thickness": 0.6, "base.albedo": 0.4}  # of the stack behind coat_data
 
 
-def test_fit_writes_a_result(work, capsys, coat_toml):
-    words = ["fit", "data.csv", "--stack", "coat.toml", "--out", "result", "--starts", "4"]
-    assert main([*words, "--max-polar-angle", "80"]) == 0
-    output = capsys.readouterr()
+def test_fit_writes_a_result(work, capsys, coat_toml, layerjax):
+    words = "fit data.csv --stack coat.toml --out result --starts 4"
+    output = layerjax(f"{words} --max-polar-angle 80")
     for word in ("layers[0].thickness", "base.albedo", "chi2/dof", "4 starts", "result/report.html"):
         assert word in output.out
     assert "fit 4/4" in output.err
@@ -48,28 +44,26 @@ def test_fit_writes_a_result(work, capsys, coat_toml):
     assert {"starts": 4, "seed": 0}.items() <= stored["fit"]["settings"].items()
     assert "low" not in (work / "result" / "fitted.toml").read_text()
     assert "data:image/png;base64," in (work / "result" / "report.html").read_text()
-    assert "--force" in refused([*words], capsys, work)
+    assert "--force" in refused(words.split(), capsys, work)
 
 
-def test_results_are_compared(work, capsys, coat_fit):
+def test_results_are_compared(work, capsys, coat_fit, layerjax):
     problem = coat_fit.problem
     worse = replace(coat_fit, vector=coat_fit.vector + 2 * coat_fit.errors)
     other = replace(coat_fit, problem=Problem(problem.stack, problem.data, objective="cube_root"))
     for name, fit in (("best", coat_fit), ("worse", worse), ("root", other)):
         save_fit(fit, name)
-    assert main(["compare", "worse", "best", "--no-refit"]) == 0
-    words = capsys.readouterr().out
+    words = layerjax("compare worse best --no-refit").out
     assert words.index(" best ") < words.index(" worse ")
     assert "cube_root" in refused(["compare", "best", "root"], capsys, work)
     assert "no posterior" in refused(["sample", "root"], capsys, work)
-    assert main(["report", "best", "--compare", "worse"]) == 0
+    layerjax("report best --compare worse")
     assert "Comparison" in (work / "best" / "report.html").read_text()
 
 
-def test_sampling_resumes_until_it_is_enough(work, capsys, coat_fit, monkeypatch):
+def test_sampling_resumes_until_it_is_enough(work, capsys, coat_fit, monkeypatch, layerjax):
     save_fit(coat_fit, "result")
-    assert main(["sample", "result", "--walkers", "8", "--max-steps", "100"]) == 1
-    assert "no estimates yet" in capsys.readouterr().out
+    assert "no estimates yet" in layerjax("sample result --walkers 8 --max-steps 100", 1).out
     assert "no estimates yet" in (work / "result" / "report.html").read_text()
     assert not (work / "result" / "summary.json").exists()
     posterior = load_posterior("result")
@@ -79,8 +73,7 @@ def test_sampling_resumes_until_it_is_enough(work, capsys, coat_fit, monkeypatch
         posterior.summary()
     assert "(walkers 8, not 10)" in refused(["sample", "result", "--walkers", "10"], capsys, work)
 
-    assert main(["sample", "result", "--max-steps", "5000"]) == 0  # the chain's own walkers
-    assert "effective samples" in capsys.readouterr().out
+    assert "effective samples" in layerjax("sample result --max-steps 5000").out  # the chain's own walkers
     longer = load_posterior("result")
     assert longer is not None
     np.testing.assert_array_equal(longer.chain[:100], posterior.chain)
@@ -89,51 +82,47 @@ def test_sampling_resumes_until_it_is_enough(work, capsys, coat_fit, monkeypatch
         assert entry["low_68"] < entry["median"] < entry["high_68"]
     pictures = (work / "result" / "report.html").read_text().count("data:image/png")
     assert pictures == 4  # curves, maps, correlation, corner
-    with monkeypatch.context() as patch:
-        patch.setattr(FitReport, "write", lambda *_: None)
-        assert main(["sample", "result", "--ess", "1000000", "--max-steps", str(len(longer.chain))]) == 1
-    assert f"layerjax sample result --ess 1000000 --max-steps {2 * len(longer.chain)}" in capsys.readouterr().out
+    monkeypatch.setattr(FitReport, "write", lambda *_: None)
+    said = layerjax(f"sample result --ess 1000000 --max-steps {len(longer.chain)}", 1).out
+    assert f"layerjax sample result --ess 1000000 --max-steps {2 * len(longer.chain)}" in said
 
 
-def test_many_files_are_fitted_as_one_is(work, capsys, monkeypatch):
+def test_many_files_are_fitted_as_one_is(work, monkeypatch, layerjax):
     monkeypatch.setattr(FitReport, "write", lambda _, folder: (folder / "report.html").write_text("drawn"))
     make_folder(work)
     (work / "scans" / "coated.csv").unlink()
-    how = ["--starts", "2", "--max-polar-angle", "80"]
-    many = ["fit-many", "scans", "--stacks", "bare.toml", "--out", "out", "--processes", "1", *how]
-    assert main(many) == 1  # one file is broken
-    output = capsys.readouterr()
+    how = "--starts 2 --max-polar-angle 80"
+    many = f"fit-many scans --stacks bare.toml --out out --processes 1 {how}"
+    output = layerjax(many, 1)  # one file is broken
     for words in ("broken.csv", "failed", "paint.csv", "1 of 2 fits are there", "out/table.csv"):
         assert words in output.out
     assert "layerjax: fits 2/2" in output.err
-    assert main(["fit", "scans/paint.csv", "--stack", "bare.toml", "--out", "alone", *how]) == 0
+    layerjax(f"fit scans/paint.csv --stack bare.toml --out alone {how}")
     own, alone = work / "out" / "paint.csv" / "bare", work / "alone"
     assert {path.name for path in own.iterdir()} == {path.name for path in alone.iterdir()}
     for name in ("fitted.toml", "problem.toml", "data.csv"):
         assert (own / name).read_text() == (alone / name).read_text(), name
-    capsys.readouterr()
-    assert "starts 2, not 3" in refused([*many, "--starts", "3"], capsys, work)
+    assert "starts 2, not 3" in layerjax(f"{many} --starts 3", 2).err
 
 
-def test_held_out_data_are_scored(work, capsys, monkeypatch):
+def test_held_out_data_are_scored(work, monkeypatch, layerjax):
     monkeypatch.setattr(FitReport, "write", lambda *_: None)
-    words = ["fit", "data.csv", "--stack", "coat.toml", "--out", "result", "--starts", "2"]
-    assert main([*words, "--select", "azimuth=0", "--hold-out", "incidence=50"]) == 0
-    output = capsys.readouterr().out
+    words = "fit data.csv --stack coat.toml --out result --starts 2 --select azimuth=0 --hold-out incidence=50"
+    output = layerjax(words).out
     assert "Held-out data" in output
     assert "θᵢ = 50°" in output
     data = load_fit("result").problem.data
     np.testing.assert_allclose(data.theta_i[data.mask], 10.0)
     assert np.all(np.abs(np.sin(np.radians(data.phi_o[data.mask]))) < 1e-9)
     assert {"selected: azimuth=0", "held out: incidence=50"} <= set(data.source.notes)
-    assert main(["predict", "result", "--score", "data.csv", "--select", "incidence=50", "azimuth=60"]) == 0
-    assert "Prediction of data.csv" in capsys.readouterr().out
+    said = layerjax("predict result --score data.csv --select incidence=50 azimuth=60").out
+    assert "Prediction of data.csv" in said
 
 
-def test_predictions_are_written(work, capsys, coat_fit):
+def test_predictions_are_written(work, capsys, coat_fit, layerjax):
     save_fit(coat_fit, "result")
-    words = ["predict", "result", "--incidence", "30,70", "20", "--out", "new.csv"]
-    assert main(words) == 0
+    words = "predict result --incidence 30,70 20 --out new.csv"
+    layerjax(words)
     with (work / "new.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert {row["theta_i"] for row in rows} == {"20", "30", "70"}
@@ -143,13 +132,11 @@ def test_predictions_are_written(work, capsys, coat_fit):
         assert intervals["predictive_q2.5"] < intervals["bsdf_q50"] < intervals["predictive_q97.5"]
         assert 0.0 < intervals["bsdf_sd"] < intervals["predictive_sd"]
         assert intervals["bsdf_mean"] == intervals["latent_mean"]  # no discrepancy is modelled
-    capsys.readouterr()
-    assert "--force" in refused(words, capsys, work)
+    assert "--force" in refused(words.split(), capsys, work)
 
 
-def test_info_says_what_is_there_and_draws_it(work, capsys, monkeypatch):
-    assert main(["info", "data.csv", "--out", "data.png"]) == 0
-    output = capsys.readouterr().out
+def test_info_says_what_is_there_and_draws_it(work, monkeypatch, layerjax):
+    output = layerjax("info data.csv --out data.png").out
     for word in ("csv", "brdf", "10°", "50°", "sigma", "median 3.00%"):
         assert word in output
     assert (work / "data.png").read_bytes().startswith(b"\x89PNG")
@@ -166,24 +153,19 @@ def test_info_says_what_is_there_and_draws_it(work, capsys, monkeypatch):
     names = ",".join(f"brdf_{k}" for k in range(400))
     rows = [f"30,{theta}," + ",".join(["1"] * 399 + ["2"]) for theta in range(-60, 61, 10)]
     (work / "spectral.csv").write_text("\n".join([f"theta_i,theta_o,{names}", *rows]))
-    assert main(["info", "spectral.csv"]) == 0
-    output = capsys.readouterr().out
+    output = layerjax("info spectral.csv").out
     assert "0, 1, 2, ..., 399 (400 in all)" in output
     assert "1 to 2" in output
 
 
-def test_convert_and_simulate_write_csv(work, coat_data):
-    assert main(["convert", "data.csv", "copy.csv"]) == 0
+def test_convert_and_simulate_write_csv(work, coat_data, layerjax):
+    layerjax("convert data.csv copy.csv")
     np.testing.assert_array_equal(read(work / "copy.csv").values, coat_data.values)
-    words = ["simulate", "--stack", "coat.toml", "--incidence", "20", "40", "--noise", "0.1", "--out", "new.csv"]
-    assert main([*words, "--seed", "3"]) == 0
+    layerjax("simulate --stack coat.toml --incidence 20 40 --noise 0.1 --out new.csv --seed 3")
     first = read(work / "new.csv")
     assert sorted(set(first.theta_i)) == [20.0, 40.0]
     # Lambertian paint alone would be albedo / pi = 0.159; the coat's start values darken it
     assert 0.02 < float(np.median(first.values)) < 0.16
-
-
-# ---- the command itself ----
 
 
 HELP = """
@@ -204,7 +186,7 @@ def test_every_command_has_its_help_without_jax() -> None:
     assert all(flag in done.stdout for flag in flags)
 
 
-def test_a_warning_for_users_is_one_line_and_shown_once(capsys, monkeypatch):
+def test_a_warning_for_users_is_one_line_and_shown_once(layerjax, monkeypatch):
     def warned(_):
         for words in ("too narrow", "too narrow", "another"):
             warnings.warn(words, lj.ResolutionWarning, stacklevel=1)
@@ -213,8 +195,8 @@ def test_a_warning_for_users_is_one_line_and_shown_once(capsys, monkeypatch):
 
     monkeypatch.setitem(commands.COMMANDS, "info", warned)
     with pytest.warns(RuntimeWarning, match="of the program"):
-        assert main(["info", "data.csv"]) == 0
-    assert capsys.readouterr().err == "layerjax: warning: too narrow\nlayerjax: warning: another\n"
+        said = layerjax("info data.csv").err
+    assert said == "layerjax: warning: too narrow\nlayerjax: warning: another\n"
 
 
 def test_so_is_one_of_threads(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -226,15 +208,12 @@ def test_so_is_one_of_threads(capfd: pytest.CaptureFixture[str], monkeypatch: py
     assert lines == [f"layerjax: warning: {words}" for words in ("task 0", "task 1", "task 2", "too narrow")]
 
 
-def test_a_fit_of_angles_in_radians_is_doubted(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    Path("data.csv").write_text("theta_i,phi_i,theta_o,phi_o,brdf\n0.5,0,0.3,180,0.1\n0.5,0,0.4,180,0.1\n")
+def test_a_fit_of_angles_in_radians_is_doubted(layerjax, work):
+    (work / "data.csv").write_text("theta_i,phi_i,theta_o,phi_o,brdf\n0.5,0,0.3,180,0.1\n0.5,0,0.4,180,0.1\n")
     with warnings.catch_warnings():
         warnings.simplefilter("default")
-        assert main(["fit", "data.csv", "--stack", "missing.toml", "--out", "result"]) != 0
-    assert "layerjax: warning: Angles: none is above 0.5°: are they radians?" in capsys.readouterr().err
+        said = layerjax("fit data.csv --stack missing.toml --out result", 2).err
+    assert "layerjax: warning: Angles: none is above 0.5°: are they radians?" in said
 
 
 def test_alarms_of_the_compiler_are_not_shown():

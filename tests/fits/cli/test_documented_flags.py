@@ -10,9 +10,7 @@ from fits.cli.arguments import COMMANDS, build_parser
 from tests.helpers.places import ROOT
 
 FLAGS = {name for one in COMMANDS.values() for name in (*one.particular, *one.shared.split())}
-OTHERS = {"--help", "--version", "--traceback", "--nthreads"}
-"""Those of the parser itself, and of `dask worker`."""
-
+OTHERS = {"--help", "--version", "--traceback", "--nthreads"}  # those of the parser itself, and of `dask worker`
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")), *sorted((ROOT / "docs" / "guides").glob("*.md"))]
 SHOWN = [
     (page, line)

@@ -7,11 +7,9 @@ import numpy as np
 import pytest
 
 import layerjax as lj
+from fits import MapOptions, Noise, SpatialPrior, open_map, slices
 from fits.cli.parser import main
-from fits.data.geometry import slices
-from fits.maps.options import MapOptions, SpatialPrior
-from fits.maps.store import FLAGS, open_map
-from fits.problem.noise import Noise
+from fits.maps.store import FLAGS
 from tests.helpers.commands import refused
 from tests.helpers.map_files import ANGLES, MASK, SIGMA, VALUES, hdf5_file
 from tests.helpers.painted_maps import numbers, stored, without
@@ -84,7 +82,6 @@ def test_defaults_and_options_arrive(place, run):
 
 
 def test_a_map_is_fitted(place, capsys):
-    """By the function itself, from a file that holds the directions as well."""
     thickness, albedo = np.array([[0.5, 0.8, 1.2]]), np.array([[0.3, 0.5, 0.6]])
     view = slices(incidence=(10.0, 50.0), outgoing=np.arange(-60.0, 61.0, 20.0))
     stack = lj.Stack([lj.Medium(thickness[..., None], 0.8)], lj.Lambertian(albedo[..., None]))
@@ -141,7 +138,6 @@ def test_an_interrupt_says_that_the_store_is_good(place, capsys, monkeypatch):
     ],
 )
 def test_bad_input_is_named(place, capsys, words, message):
-    """Of a file in the place of another, or of further options."""
     (place / "file.zarr").write_text("")
     change, more = ({}, words.split()) if words.startswith("--") else (dict([words.split("=")]), [])
     assert message in refused([*(change.get(word, word) for word in WORDS), *more], capsys, place)

@@ -9,12 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from fits import load_fit, load_posterior, sample, save_fit
 from fits.cli.parser import main
 from fits.optimise import multi_start as starts
 from fits.reports.html import FitReport
 from fits.reports.plots.data import data_picture
-from fits.reports.results import load_fit, load_posterior, save_fit
-from fits.sampling.sample import sample
 from fits.store import Store
 from tests.helpers.coats import make_folder
 from tests.helpers.files import contents, largest_file, read_only

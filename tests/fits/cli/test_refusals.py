@@ -115,10 +115,7 @@ def test_a_cluster_that_is_not_there_is_named(work, capsys):
     ("error", "fragment"),
     [
         (MemoryError(), "memory is not enough: MemoryError"),
-        (
-            jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of\nmemory"),
-            "not enough: RESOURCE_EXHAUSTED: Out of memory",
-        ),
+        (jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of\nmemory"), "enough: RESOURCE_EXHAUSTED: Out of memory"),
         (OverflowError("cannot convert float infinity to integer"), "a number is too large: cannot convert"),
     ],
 )

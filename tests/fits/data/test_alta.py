@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from fits.data.geometry import direction
+from tests.helpers.merl import half_angles
 
 RANDOM = np.random.default_rng(1)
 LIGHT, VIEW = (direction(RANDOM.uniform(1, 80, 40), RANDOM.uniform(-180, 180, 40)) for _ in range(2))
@@ -24,25 +24,12 @@ def around(w):
     return np.arctan2(w[:, 1], w[:, 0])
 
 
-def halves(light, view):
-    half = light + view
-    return half / np.linalg.norm(half, axis=1, keepdims=True)
-
-
-def rusinkiewicz():
-    """Half and difference angles (N, 4), by turning the half vector to the pole."""
-    half = halves(LIGHT, VIEW)
-    angles = np.stack([-around(half), -polar(half)], axis=1)
-    turned = np.array([Rotation.from_euler("zy", one).apply(view) for one, view in zip(angles, VIEW, strict=True)])
-    return np.stack([polar(half), around(half), polar(turned), around(turned)], axis=1)
-
-
 def relative(light, view):
     """What does not change if all turns about the normal: cosines and the product, (N, 4)."""
     return np.stack([light[:, 2], view[:, 2], np.sum(light * view, axis=1), np.cross(light, view)[:, 2]], axis=1)
 
 
-TURN, HALF = around(VIEW) - around(LIGHT), rusinkiewicz()
+TURN, HALF = around(VIEW) - around(LIGHT), half_angles(VIEW, LIGHT).T
 WHOLE = {
     "SPHERICAL_TL_PL_TV_PV": np.stack([polar(LIGHT), around(LIGHT), polar(VIEW), around(VIEW)], axis=1),
     "CARTESIAN": np.hstack([VIEW, LIGHT]),
@@ -69,14 +56,12 @@ def test_coordinates(reading, coordinates):
 
 @pytest.mark.parametrize("coordinates", ["RUSIN_TH_TD", "COS_TH"])
 def test_half_angles_alone(reading, coordinates):
-    """The angle between half vector and normal is that of the file, and that between half vector and light."""
     angles = RANDOM.uniform(0.05, 0.6, (20, 1 if coordinates == "COS_TH" else 2))
     numbers = np.cos(angles) if coordinates.startswith("COS") else angles
     data = reading(alta(coordinates, np.hstack([numbers, np.ones((20, 1))])))
-    half = halves(data.wi, data.wo)
-    np.testing.assert_allclose(polar(half), angles[:, 0], atol=1e-9)
-    difference = np.arccos(np.clip(np.sum(half * data.wi, axis=1), -1, 1))
-    np.testing.assert_allclose(difference, angles[:, 1] if angles.shape[1] == 2 else 0.0, atol=1e-7)
+    theta_h, _, theta_d, _ = half_angles(data.wi, data.wo)
+    np.testing.assert_allclose(theta_h, angles[:, 0], atol=1e-9)
+    np.testing.assert_allclose(theta_d, angles[:, 1] if angles.shape[1] == 2 else 0.0, atol=1e-7)
 
 
 def test_what_values_are(reading):

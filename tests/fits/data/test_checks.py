@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 import fits
-from fits.data.measurements import Measurements
 from fits.reports.data_summary import data_statements, energies, reciprocity, repeats, sides
 from tests.helpers.models import along
 from tests.helpers.places import COATINGS
@@ -18,11 +17,11 @@ SCANS = fits.slices(ANGLES)
 SIGNED = np.degrees(np.arctan2(SCANS.wo[:, 0], SCANS.wo[:, 2]))
 
 
-def measured(values, geometry=HEMISPHERE) -> Measurements:
+def measured(values, geometry=HEMISPHERE) -> fits.Measurements:
     return along(geometry, np.broadcast_to(values, len(geometry))[:, None])
 
 
-def statement(data: Measurements, of: str) -> str:
+def statement(data: fits.Measurements, of: str) -> str:
     return " ".join(words for words in data_statements(data) if words.startswith(f"{of}:"))
 
 
@@ -64,7 +63,6 @@ def test_repeats_tell_the_noise() -> None:
 
 
 def test_the_shipped_coatings_are_reciprocal_and_dark() -> None:
-    """Their own README: reciprocal to some percent, reflectances of 0.06 to 0.10."""
     steel = fits.read(COATINGS / "nite_on_blasted_steel1008_650nm_hemisphere.csv")
     assert 0.01 < reciprocity(steel).median < 0.05
     assert all(0.06 < one.share[0] / one.covered < 0.11 for one in energies(steel))

@@ -1,15 +1,15 @@
-"""CSV: what its columns mean, what is estimated and left out, and that what is written comes back."""
+"""CSV: what its columns mean, what is estimated and left out, and that what is written comes back; totals too."""
 
 import os
 from dataclasses import replace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 
-from fits.data.formats import write_csv
+from fits import Measurements, Totals, read, write_csv
 from fits.data.geometry import direction
-from fits.data.measurements import Measurements, Source
-from fits.data.reading import read
+from fits.data.measurements import Source
 from tests.helpers.places import COATINGS
 
 HEADER = "theta_i,phi_i,theta_o,phi_o,brdf"
@@ -30,27 +30,12 @@ def test_a_real_file_against_numpy():
     assert data.source.notes == ("columns not used: n",)
 
 
-def test_capitals_in_names_of_columns_are_as_good(reading, tmp_path):
+def test_capitals_in_names_of_columns_are_as_good(reading):
     data = reading("Theta_I,PHI_I,theta_O,Phi_o,BRDF_Red,BRDF_Red_STD,Used\n10,180,20,0,0.5,0.1,1\n")
     assert (data.channels, data.source.notes) == (("Red",), ())
     np.testing.assert_array_equal([data.values, data.sigma], [[[0.5]], [[0.1]]])
-    write_csv(data, tmp_path / "again.csv")
-    assert read(tmp_path / "again.csv").channels == ("Red",)
     assert reading("THETA_I,THETA_O,BRDF\n10,20,0.5\n").channels == ("value",)
-    totals = reading("Theta_i,Total_Reflectance\n0,0.3\n")
-    np.testing.assert_array_equal(totals.values, [[0.3]])
-    for channel in ("Cos", "STD"):
-        with pytest.raises(ValueError, match=f"channel '{channel}' cannot be written"):
-            write_csv(replace(data, channels=(channel,)), tmp_path / "other.csv")
-
-
-def test_comments_may_be_of_windows(tmp_path):
-    path = tmp_path / "windows.csv"
-    text = f"# attribution: Prüfstand, 20 °C … Nr. 7\n{HEADER}\n10,180,20,0,0.5\n"
-    path.write_bytes(text.encode("cp1252"))
-    data = read(path)
-    assert data.source.attribution == "Prüfstand, 20 °C … Nr. 7"
-    assert len(data) == 1
+    np.testing.assert_array_equal(reading("Theta_i,Total_Reflectance\n0,0.3\n").values, [[0.3]])
 
 
 COSINE = 1 / np.cos(np.radians(60))
@@ -109,7 +94,6 @@ def test_missing_spread_is_estimated_and_noted(reading):
 
 @pytest.mark.parametrize("column", ["std", "sigma"])
 def test_a_spread_beside_a_single_value_column_is_taken_for_its_own(reading, column):
-    """A noise of 5 % was assumed where a file said in a column `sigma` what it is."""
     data = reading(f"{HEADER},{column}\n10,180,0,0,2.0,0.1\n10,180,60,0,4.0,0.3\n")
     np.testing.assert_allclose(data.sigma[:, 0], [0.1, 0.3])
     assert data.source.notes == (f"column {column} taken for the standard deviation of brdf",)
@@ -152,6 +136,8 @@ def test_comments_quotes_blanks_and_an_attribution(reading):
     data = reading(f"{text}10, 180, 20, 0, 1e-3\r\n\n")
     assert data.values.tolist() == [[1e-3]]
     assert (data.source.attribution, data.source.notes) == ("A. Author, CC-BY", ())
+    windows = f"# attribution: Prüfstand, 20 °C … Nr. 7\n{HEADER}\n10,180,20,0,0.5\n".encode("cp1252")
+    assert reading(windows).source.attribution == "Prüfstand, 20 °C … Nr. 7"
 
 
 def test_written_csv_comes_back_exactly(tmp_path):
@@ -192,7 +178,7 @@ def test_the_writer_is_atomic_and_does_not_overwrite(tmp_path, monkeypatch):
     with pytest.raises(ValueError, match=r"out\.csv: the file exists already"):
         write_csv(ONE, path)
     with monkeypatch.context() as patch:
-        patch.setattr(os, "replace", full_disk)
+        patch.setattr(os, "replace", Mock(side_effect=OSError("disk full")))
         with pytest.raises(OSError, match="disk full"):
             write_csv(ONE, path, force=True)
     assert path.read_text() == "precious"
@@ -203,24 +189,78 @@ def test_the_writer_is_atomic_and_does_not_overwrite(tmp_path, monkeypatch):
         write_csv(ONE, tmp_path / "no" / "out.csv")
 
 
-def full_disk(*_):
-    raise OSError("disk full")
-
-
 def test_channels_come_back_or_are_not_written(tmp_path):
-    """Not written: those whose column would be read as another."""
     path = tmp_path / "out.csv"
 
     def with_channel(channel):
         return Measurements(ONE.wi, ONE.wo, [[1.0, 2.0]], [[0.1, 0.2]], ONE.mask, ("red", channel))
 
-    for channel in ("cos", "cos_red", "blue_std", "blue_sigma", "sigma", "", "red ", "red\nedge"):
+    for channel in ("cos", "Cos", "STD", "cos_red", "blue_std", "blue_sigma", "sigma", "", "red ", "red\nedge"):
         with pytest.raises(ValueError, match=r"channel .* cannot be written: its column would be read as"):
             write_csv(with_channel(channel), path)
         assert not path.exists()
-    for channel in ("cosine", "650nm", "red edge", "a, b", "value", "brdf"):
+    for channel in ("cosine", "Red", "650nm", "red edge", "a, b", "value", "brdf"):
         data = with_channel(channel)
         write_csv(data, path, force=True)
         again = read(path)
         assert again.channels == data.channels
         np.testing.assert_array_equal([again.values, again.sigma], [data.values, data.sigma])
+
+
+TOTALS = "theta_i,total_reflectance,total_reflectance_std,total_transmittance,total_transmittance_std"
+
+
+def test_every_cell_is_a_reading(reading):
+    found = reading(f"# a slab\n{TOTALS},operator\n0,0.3,0.01,0.5,0.02,me\n60,0.4,0.01,,,me\n")
+    assert isinstance(found, Totals)
+    assert found.kinds == ("reflectance", "reflectance", "transmittance")
+    np.testing.assert_allclose(found.values[:, 0], [0.3, 0.4, 0.5])
+    np.testing.assert_allclose(found.sigma[:, 0], [0.01, 0.01, 0.02])
+    np.testing.assert_allclose(found.theta_i, [0.0, 60.0, 0.0], atol=1e-9)
+    assert found.wo[:, 2].tolist() == pytest.approx([1.0, 0.5, -1.0])
+    assert found.source.notes == ("columns not used: operator",)
+
+
+@pytest.mark.parametrize("missing", ["", "nan", "NA"])
+def test_rows_without_any_value_are_counted(reading, missing):
+    rows = f"0,0.3,0.5\n10,{missing},{missing}\n20,0.3,{missing}\n30,{missing},{missing}\n"
+    found = reading(f"theta_i,total_reflectance,total_transmittance\n{rows}")
+    np.testing.assert_allclose(found.values[:, 0], [0.3, 0.3, 0.5])
+    assert found.source.notes == ("skipped: 2 rows without a value (an empty cell, or nan)",)
+
+
+def test_channels_and_unscattered_light(reading):
+    found = reading("theta_i,unscattered_transmittance_red,unscattered_transmittance_blue\n0,0.3,0.1\n")
+    assert found.channels == ("red", "blue")
+    assert found.kinds == ("unscattered",)
+    assert found.sigma is None
+
+
+def test_readings_that_were_repeated_come_back(reading, tmp_path):
+    names = "theta_i,total_reflectance,total_reflectance_std,unscattered_transmittance,unscattered_transmittance_std"
+    found = reading(f"{names}\n0,0.3,0.01,0.2,0.01\n0,0.31,0.02,,\n30,0.4,0.01,0.1,0.01\n")
+    write_csv(found, tmp_path / "again.csv")
+    again = read(tmp_path / "again.csv")
+    assert again.kinds == found.kinds == ("reflectance",) * 3 + ("unscattered",) * 2
+    for name in ("theta_i", "values", "sigma"):
+        np.testing.assert_allclose(getattr(again, name), getattr(found, name), atol=1e-9)
+
+
+def test_a_bsdf_beside_a_column_of_totals_is_a_bsdf(reading):
+    found = reading("theta_i,theta_o,brdf,total_reflectance\n0,20,0.1,0.3\n")
+    assert not isinstance(found, Totals)
+    assert "columns not used: total_reflectance" in found.source.notes
+
+
+def test_what_would_not_come_back_is_not_written(tmp_path):
+    turned = replace(Totals.of([30, 30], reflectance=0.3), wi=direction(30, [180, 90]))
+    for totals, message in (
+        (turned, "several azimuths at 30 degrees"),
+        (Totals.of(reflectance=0.1, channels=("a_std",)), "'a_std' of a channel would not come back"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            write_csv(totals, tmp_path / "new.csv")
+    assert not list(tmp_path.iterdir())
+    write_csv(Totals.of(reflectance=0.1), tmp_path / "new.csv")
+    with pytest.raises(ValueError, match="exists"):
+        write_csv(Totals.of(reflectance=0.2), tmp_path / "new.csv")

@@ -6,9 +6,8 @@ import re
 import numpy as np
 import pytest
 
-from fits.data.geometry import slices
-from fits.data.measurements import LARGEST, Measurements
-from fits.data.reading import ReadOptions, read
+from fits import Measurements, ReadOptions, read, slices
+from fits.data.measurements import LARGEST
 from fits.names import FORMATS
 from tests.helpers.data_files import FILES, written
 from tests.helpers.mutations import mutated

@@ -1,21 +1,15 @@
 """MERL tables: a file written from a formula in half and difference angles is looked up again, by angles or bins."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
-import layerjax as lj
+from fits import Geometry, read, slices
 from fits.cli.parser import main
-from fits.data.formats.merl import half_difference
-from fits.data.geometry import Geometry, direction, slices
-from fits.data.reading import read
+from fits.data.geometry import direction
 from fits.data.scans import in_plane, incidences, relative_azimuth
-from fits.optimise.fit import fit
-from fits.problem.parameters import Free
 from tests.helpers.commands import refused
 from tests.helpers.data_files import written
-from tests.helpers.merl import SCALE, SHAPE, centre_angles, centre_pairs, smooth_bsdf, write_merl
+from tests.helpers.merl import SCALE, SHAPE, centre_angles, centre_pairs, half_angles, smooth_bsdf, write_merl
 
 HEADER = np.array(SHAPE, "<i4").tobytes()
 SIZE = len(HEADER) + 8 * 3 * np.prod(SHAPE)
@@ -31,28 +25,16 @@ def path(tmp_path_factory, table):
     return write_merl(tmp_path_factory.mktemp("merl") / "synthetic.binary", table)
 
 
-def rotate(v, axis, angle):
-    """Rodrigues' formula, as the database's own code turns its vectors."""
-    c, s = np.cos(angle), np.sin(angle)
-    return c * v + s * np.cross(axis, v) + (1 - c) * (axis @ v) * axis
+def angles_of(pairs):
+    """Half and difference angles that the table is made of, (3, N)."""
+    theta_h, _, theta_d, phi_d = half_angles(pairs.wi, pairs.wo)
+    return np.array([theta_h, theta_d, phi_d % np.pi])
 
 
-def own_angles(geometry):
-    """Half and difference angles, (3, N), by turning wi back: by -phi_h about the normal, then by -theta_h about y."""
-    angles = []
-    for wi, wo in zip(geometry.wi, geometry.wo, strict=True):
-        half = (wi + wo) / np.linalg.norm(wi + wo)
-        theta_h, phi_h = np.arccos(min(half[2], 1.0)), np.arctan2(half[1], half[0])
-        turned = rotate(rotate(wi, np.array([0.0, 0, 1]), -phi_h), np.array([0.0, 1, 0]), -theta_h)
-        angles.append((theta_h, np.arccos(np.clip(turned[2], -1, 1)), np.arctan2(turned[1], turned[0]) % np.pi))
-    return np.array(angles).T
-
-
-def bins_of(angles):
-    """Table indices (N, 3) of half and difference angles."""
-    theta_h, theta_d, phi_d = angles
-    shares = np.stack([np.sqrt(theta_h * 2 / np.pi), theta_d * 2 / np.pi, phi_d / np.pi], axis=-1)
-    return np.floor(shares * SHAPE).astype(int)
+def bins_of(pairs):
+    """Table indices (N, 3)."""
+    theta_h, theta_d, phi_d = angles_of(pairs) * 2 / np.pi
+    return np.floor(np.stack([np.sqrt(theta_h), theta_d, phi_d / 2], axis=-1) * SHAPE).astype(int)
 
 
 @pytest.fixture(scope="module")
@@ -64,9 +46,9 @@ def geometry():
 
 def test_centre_lookup_reads_bins_as_they_are_at_their_centre_angles(path, geometry, table):
     for data in (read(path), read(path, geometry=geometry)):
-        index = bins_of(own_angles(data))
+        index = bins_of(data)
         centres = ((index + 0.5) / SHAPE) ** [2, 1, 1] * [np.pi / 2, np.pi / 2, np.pi]
-        np.testing.assert_allclose(np.stack(half_difference(data.wi, data.wo), axis=-1), centres, rtol=0, atol=1e-9)
+        np.testing.assert_allclose(angles_of(data).T, centres, rtol=0, atol=1e-9)
         np.testing.assert_allclose(data.values, table[:, *index.T].T, rtol=1e-14)
         assert len(np.unique(index, axis=0)) == len(data)
         assert data.mask.all()
@@ -122,42 +104,10 @@ def test_light_along_the_normal_and_pairs_at_the_horizon(path):
         read(path, geometry=Geometry(low[0][:1], low[1][:1]))
 
 
-def flakes(thickness, albedo):
-    medium = lj.Medium(thickness=thickness, albedo=0.9, phase=lj.SGGX("surface", 0.02))
-    return lj.Stack([medium], base=lj.Lambertian(albedo=albedo))
-
-
-@pytest.fixture(scope="module")
-def flakes_path(tmp_path_factory):
-    """An exact table of flakes of thickness 0.8 over Lambertian(0.5), with values near the default slices only."""
-    wi, wo = centre_pairs(np.stack(np.unravel_index(np.arange(np.prod(SHAPE)), SHAPE), axis=-1))
-    near = np.zeros(len(wi), bool)
-    for theta in (10.5, 30.5, 50.5, 70.5):
-        near |= (abs(np.degrees(np.arccos([wi[:, 2], wo[:, 2]])) - theta) < 0.3).any(axis=0)
-    near &= (wi[:, 2] > 0) & (wo[:, 2] > 0)
-    values = np.full(len(wi), -1.0)
-    values[near] = lj.evaluate(flakes(0.8, 0.5), wi[near], wo[near], lj.SingleScattering())[:, 0]
-    return write_merl(
-        tmp_path_factory.mktemp("merl") / "flakes.binary", np.broadcast_to(values.reshape(SHAPE), (3, *SHAPE))
-    )
-
-
-@pytest.mark.slow
-def test_an_exact_table_gives_back_its_stack(flakes_path):
-    data = read(flakes_path)
-    assert data.mask.all()
-    data = replace(data, sigma=0.01 * data.values)
-    start = flakes(Free(1.5, 0.05, 5.0), Free(0.3, 0.0, 1.0))
-    found = fit(start, data, transport=lj.SingleScattering(), starts=2)
-    assert found.converged
-    assert found.values["layers[0].thickness"] == pytest.approx(0.8, abs=1e-7)
-    assert found.values["base.albedo"] == pytest.approx(0.5, abs=1e-7)
-
-
 def test_linear_lookup_recovers_the_formula(path, geometry, table):
     data = read(path, geometry=geometry, lookup="linear")
     np.testing.assert_array_equal([data.wi, data.wo], [geometry.wi, geometry.wo])
-    expected = smooth_bsdf(*own_angles(geometry)).T
+    expected = smooth_bsdf(*angles_of(geometry)).T
     # linear interpolation is off by at most an eighth of the second difference along each axis
     bound = sum(abs(np.diff(table, 2, axis=axis)).max(axis=(1, 2, 3)) for axis in (1, 2, 3)) / 8
     assert (abs(data.values - expected) <= 1.05 * bound).all()
@@ -165,23 +115,17 @@ def test_linear_lookup_recovers_the_formula(path, geometry, table):
     assert data.mask.all()
     assert data.channels == ("red", "green", "blue")
     assert "centre at i + 1/2" in data.source.notes[0]
+    assert len(read(path, lookup="linear")) == 4 * (35 + 34 + 34)
     # mirror, normal and retro directions
     edges = Geometry(direction([30, 0, 30, 80, 0], 180), direction([30, 0, -30, 80, 85], 0))
-    data, expected = read(path, geometry=edges, lookup="linear"), smooth_bsdf(*own_angles(edges)).T
+    data, expected = read(path, geometry=edges, lookup="linear"), smooth_bsdf(*angles_of(edges)).T
     assert data.mask.all()
     np.testing.assert_allclose(data.values[:, :2], expected[:, :2], rtol=0.02)
 
 
 def test_nearest_lookup_takes_the_bin_of_the_database_code(path, geometry, table):
     data = read(path, geometry=geometry, lookup="nearest")
-    np.testing.assert_allclose(data.values, table[:, *bins_of(own_angles(geometry)).T].T, rtol=1e-14)
-
-
-def test_default_slices(path):
-    data = read(path, lookup="linear")
-    assert len(data) == 4 * (35 + 34 + 34)
-    assert sorted(set(data.theta_i)) == [10, 30, 50, 70]
-    assert len(np.unique(np.hstack([data.wi, data.wo]).round(6), axis=0)) == len(data)
+    np.testing.assert_allclose(data.values, table[:, *bins_of(geometry).T].T, rtol=1e-14)
 
 
 def test_bins_without_measurement_are_masked(tmp_path, table):
@@ -197,7 +141,7 @@ def test_bins_without_measurement_are_masked(tmp_path, table):
 
 def test_bins_that_hold_nan_are_left_out_and_counted(tmp_path, path, table):
     whole, holed = read(path), table / SCALE[:, None, None, None]
-    holed[1, *bins_of(own_angles(whole))[:2].T] = np.nan  # one channel is enough
+    holed[1, *bins_of(whole)[:2].T] = np.nan  # one channel is enough
     other = written(tmp_path, HEADER + holed.tobytes(), "holes.binary")
     data = read(other)
     np.testing.assert_array_equal(np.flatnonzero(whole.mask & ~data.mask), [0, 1])
@@ -208,47 +152,38 @@ def test_bins_that_hold_nan_are_left_out_and_counted(tmp_path, path, table):
     assert "skipped: 2 bins of the table that hold nan" in every.source.notes
 
 
-# ---- many bins at once ----
-
 COUNT = 3000
 
 
 @pytest.fixture(scope="module")
-def holed(table):
-    """Without a measurement in one channel of a block of bins."""
+def holed(tmp_path_factory, table):
+    """A file, without a measurement in one channel of a block of bins; its table, and which bins can be read."""
     values = table.copy()
     values[1, 40:60, :30, :90] = -SCALE[1]
-    return values
-
-
-@pytest.fixture(scope="module")
-def holed_path(tmp_path_factory, holed):
-    return write_merl(tmp_path_factory.mktemp("merl") / "holed.binary", holed)
-
-
-@pytest.fixture(scope="module")
-def readable(holed):
     wi, wo = centre_pairs(np.stack(np.unravel_index(np.arange(np.prod(SHAPE)), SHAPE), axis=-1))
-    return ((wi[:, 2] > 0) & (wo[:, 2] > 0)).reshape(SHAPE) & (holed > 0).all(axis=0)
+    readable = ((wi[:, 2] > 0) & (wo[:, 2] > 0)).reshape(SHAPE) & (values > 0).all(axis=0)
+    return write_merl(tmp_path_factory.mktemp("merl") / "holed.binary", values), values, readable
 
 
-def test_every_bin_is_read_once(holed_path, holed, readable):
-    data = read(holed_path, bins="all")
-    bins = bins_of(half_difference(data.wi, data.wo))
+def test_every_bin_is_read_once(holed):
+    path, values, readable = holed
+    data = read(path, bins="all")
+    bins = bins_of(data)
     np.testing.assert_array_equal(bins, np.argwhere(readable))
-    np.testing.assert_allclose(data.values, holed[:, *bins.T].T, rtol=1e-12)
+    np.testing.assert_allclose(data.values, values[:, *bins.T].T, rtol=1e-12)
     assert data.mask.all()
     np.testing.assert_allclose(data.phi_i, 180.0, atol=1e-8)
 
 
 @pytest.mark.parametrize("strata", ["bins", "flux"])
-def test_a_choice_has_bins_as_they_are_and_none_twice(holed_path, holed, readable, strata):
-    data = read(holed_path, bins=COUNT, strata=strata)
-    bins = bins_of(half_difference(data.wi, data.wo))
+def test_a_choice_has_bins_as_they_are_and_none_twice(holed, strata):
+    path, values, readable = holed
+    data = read(path, bins=COUNT, strata=strata)
+    bins = bins_of(data)
     assert len(np.unique(bins, axis=0)) == len(data) == COUNT
     assert readable[tuple(bins.T)].all()
-    np.testing.assert_allclose(data.values, holed[:, *bins.T].T, rtol=1e-12)
-    again, other = (read(holed_path, bins=COUNT, strata=strata, seed=seed) for seed in (0, 1))
+    np.testing.assert_allclose(data.values, values[:, *bins.T].T, rtol=1e-12)
+    again, other = (read(path, bins=COUNT, strata=strata, seed=seed) for seed in (0, 1))
     np.testing.assert_array_equal(again.wi, data.wi)
     assert not np.array_equal(other.wi, data.wi)
     if strata == "bins":  # blocks of a fifth of each index have their share: chance alone would be off by 1 / sqrt(N)
@@ -267,17 +202,14 @@ def test_a_choice_by_flux_has_means_of_the_hemisphere(path):
         assert found.mean() == pytest.approx(expected, abs=0.5 * found.std() / np.sqrt(COUNT))
 
 
-def test_on_the_command_line(holed_path, tmp_path, capsys):
-    words = ["convert", str(holed_path), str(tmp_path / "some.csv"), "--read", "strata=flux"]
+def test_on_the_command_line(path, tmp_path, capsys):
+    words = ["convert", str(path), str(tmp_path / "some.csv"), "--read", "strata=flux"]
     assert "strata is given without a number of bins" in refused(words, capsys, tmp_path)
     assert main([*words, "bins=50"]) == 0
     assert len(read(tmp_path / "some.csv")) == 50
 
 
-# ---- what is refused ----
-
-
-def test_bad_arguments(holed_path):
+def test_bad_arguments(path):
     bins = "must be a whole number of at least 1, or 'all'"
     for given, message in (
         ({"lookup": "cubic"}, "lookup is 'cubic', must be one of centre, linear, nearest"),
@@ -291,7 +223,7 @@ def test_bad_arguments(holed_path):
         ({"bins": 10, "lookup": "linear"}, "bins stands beside geometry or lookup"),
     ):
         with pytest.raises(ValueError, match=message):
-            read(holed_path, **given)
+            read(path, **given)
 
 
 def test_bad_files(tmp_path):

@@ -1,13 +1,13 @@
-"""RGL's tensor files: what is read back of a table that a formula made, and of files that are broken."""
+"""RGL's tensor files: what is read back of a table that a formula made, files that are broken, and densities."""
 
 import numpy as np
 import pytest
 
+from fits import Geometry, read, slices
 from fits.data.formats import rgl
+from fits.data.formats._square import Density, Interpolation
 from fits.data.formats._tensor_file import fields_as_bytes, read_fields
 from fits.data.formats.rgl_table import Table, read_table, table_as_bytes
-from fits.data.geometry import Geometry, slices
-from fits.data.reading import read
 from tests.helpers.data_files import written
 
 RGB = np.array([0.2, 0.5, 0.8])
@@ -81,13 +81,8 @@ def test_azimuths_of_a_part_of_the_turn_stand_for_all(reading, last, turns):
         diffuse(reading(table_as_bytes(table), geometry=Geometry(seen.wi @ rotation, seen.wo @ rotation)), 0.03)
 
 
-def test_what_is_written_is_read(path, tmp_path):
+def test_what_is_written_is_read(path):
     assert table_as_bytes(read_table(path)) == path.read_bytes()
-    fields = {"one": np.arange(6, dtype=np.int64).reshape(2, 3), "text": "words", "empty": np.empty((0, 2), np.float32)}
-    again = read_fields(written(tmp_path, fields_as_bytes(fields), "fields"))
-    assert np.array_equal(again["one"], fields["one"])
-    assert bytes(again["text"]) == b"words"
-    assert again["empty"].shape == (0, 2)
 
 
 @pytest.mark.parametrize(
@@ -123,3 +118,20 @@ def test_bad_arguments(path):
     ):
         with pytest.raises(ValueError, match=message):
             read(path, **given)
+
+
+RANDOM = np.random.default_rng(3)
+FIRST, SECOND = RANDOM.uniform(0.1, 2.0, (2, 5, 7))
+SECOND[:2] = 0.0
+SECOND[3, 2:5] = 0.0
+DENSITY = Density(np.stack([FIRST, SECOND]))  # two densities, one of them with rows and cells that are 0
+
+
+@pytest.mark.parametrize("table", [0, 1])
+def test_what_is_drawn_goes_back_to_the_numbers_it_was_drawn_by(table):
+    sides = np.linspace(0.0, 1.0, 41)[1:-1]
+    x, y = (drawn[table] for drawn in DENSITY.drawn(sides, sides))
+    only = Interpolation(np.full((x.size, 1), table), np.ones((x.size, 1)))
+    sx, sy, _ = DENSITY.undrawn(x.ravel(), y.ravel(), only)
+    np.testing.assert_allclose(sx.reshape(x.shape), np.tile(sides, (39, 1)), atol=1e-9)
+    np.testing.assert_allclose(sy.reshape(x.shape), np.tile(sides, (39, 1)).T, atol=1e-9)

@@ -4,10 +4,8 @@ import numpy as np
 import pytest
 
 import layerjax as lj
-from fits.cli.parser import main
-from fits.data.formats.rxt import SMOOTH, read_slab
-from fits.data.reading import read
-from fits.data.spheres import Sphere, Spheres
+from fits import Sphere, Spheres, read, read_slab
+from fits.data.formats.rxt import SMOOTH
 from tests.helpers.data_files import RXT, written
 
 BARE, ONE = RXT.format(spheres=0), RXT.format(spheres=1)
@@ -128,22 +126,19 @@ def test_two_beams_need_no_sphere(slab, comment):
     assert slab(text.replace(comment, "iad -x 8 -g 0.9")).totals.spheres is not None
 
 
-def test_the_command_line_chooses_rows_and_spheres(tmp_path, capsys):
-    path = str(written(tmp_path, f"{ONE}L r n\n600 0.3 1.3\n620 0.25 1.3\n900 0.2 1.5\n", "slab.rxt"))
-    out = str(tmp_path / "a.csv")
-    assert main(["convert", path, out]) == 2
-    assert "restrict the wavelengths" in capsys.readouterr().err
-    assert main(["convert", path, out, "--read", "wavelengths=600,610,620"]) == 2
-    assert "must be two numbers in nm, the lowest and the highest" in capsys.readouterr().err
-    for more, corrected in (([], False), (["corrected=yes"], True)):
-        assert (
-            main(["info", path, "--out", str(tmp_path / "a.png"), "--force", "--read", "wavelengths=600,620", *more])
-            == 0
-        )
-        said = capsys.readouterr().out
+def test_the_command_line_chooses_rows_and_spheres(tmp_path, layerjax):
+    path, out = (
+        written(tmp_path, f"{ONE}L r n\n600 0.3 1.3\n620 0.25 1.3\n900 0.2 1.5\n", "slab.rxt"),
+        tmp_path / "a.csv",
+    )
+    assert "restrict the wavelengths" in layerjax(f"convert {path} {out}", 2).err
+    said = layerjax(f"convert {path} {out} --read wavelengths=600,610,620", 2).err
+    assert "must be two numbers in nm, the lowest and the highest" in said
+    for more, corrected in (("", False), ("corrected=yes", True)):
+        said = layerjax(f"info {path} --out {tmp_path}/a.png --force --read wavelengths=600,620 {more}").out
         assert "600 nm, 620 nm" in said
         assert ("as measured with an integrating sphere" in said) != corrected
-    assert main(["convert", path, out, "--read", "wavelengths=600,620", "corrected=yes"]) == 0
+    layerjax(f"convert {path} {out} --read wavelengths=600,620 corrected=yes")
     np.testing.assert_allclose(read(out).values, [[0.3, 0.25]])
-    assert main(["info", out, "--read", "corrected=yes"]) == 2
-    assert "wavelengths and corrected apply to rxt files only" in capsys.readouterr().err
+    said = layerjax(f"info {out} --read corrected=yes", 2).err
+    assert "wavelengths and corrected apply to rxt files only" in said

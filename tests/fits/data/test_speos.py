@@ -42,7 +42,6 @@ def share(data, which):
 
 
 def test_a_file_of_speos():
-    """Peaks at the mirror direction and, refracted by an index of 1.5, below."""
     data = read(GAUSSIAN)
     np.testing.assert_allclose(data.theta_i, 30)
     np.testing.assert_allclose(data.phi_i, 180)
@@ -53,11 +52,8 @@ def test_a_file_of_speos():
         assert data.phi_o[peak] == 0
     with pytest.raises(ValueError, match="quantity is 'brdf', this speos file says 'brdf_cos'"):
         read(GAUSSIAN, quantity="brdf")
-
-
-def test_a_file_of_speos_holds_the_shares_that_it_states():
-    """4 % above and 95 % below at perpendicular incidence, and here at 30 degrees: integrals of the intensities."""
-    lines, data = GAUSSIAN.read_text().splitlines(), read(GAUSSIAN)
+    # 4 % above and 95 % below at perpendicular incidence, and here at 30 degrees: integrals of the intensities
+    lines = GAUSSIAN.read_text().splitlines()
     starts = [number for number, line in enumerate(lines) if line == "41 95"]
     for start, stated, theta in zip(starts, (0.04, 0.95), (30, 160), strict=True):
         phi, rows = np.loadtxt(lines[start + 1 : start + 2]), np.loadtxt(lines[start + 2 : start + 43])
@@ -96,7 +92,6 @@ def test_intensities_are_divided_by_the_cosine(reading):
 
 
 def test_azimuths_may_be_left_to_symmetry(reading):
-    """A Lambertian of 20 %: 0.2 / pi whatever part of the turn there is."""
     for phi in (np.array([0.0]), np.linspace(0, 180, 7), np.linspace(0, 345, 24), PHI):
         data = reading(anisotropic(table(THETA, 3.0, phi), "0\t0\n\n1\n550\t20\n"))
         np.testing.assert_allclose(data.values, 0.2 / np.pi, rtol=1e-5)  # linear between nodes 3 degrees apart

@@ -11,7 +11,6 @@ ASTM = "ASTM 1\nDATE 4/8/1998\nSAMPLE Paint, blue\nNUM_POINTS 2\nVARS theta_i,ph
 
 
 def test_astm_in_radians(reading):
-    """Both azimuths in one frame, as the directions stand."""
     data = reading(f"{ASTM}0.5,3.14159265,0.25,0.1,0.1,0.2,0.3\n\n0.5,1,-0.25,6.2,0.4,0.5,-0.01\n")
     assert data.channels == ("red", "green", "blue")
     half, quarter, first, second = np.degrees([0.5, 0.25, 0.1, 6.2])

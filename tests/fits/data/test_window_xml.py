@@ -53,8 +53,6 @@ def test_rings_stand_for_no_more_patches_than_there_may_be(reading):
     assert peak < 200e6  # 40 million patches would take a GB
 
 
-# ---- trees of tensors ----
-
 EIGHT = "{ {1} {2} {3} {4} {5} {6} {7} { 10 11 12 13 14 15 16 17 } }"
 
 
@@ -75,23 +73,6 @@ def test_boxes_by_hand():
     np.testing.assert_array_equal(look_up(tree, found.low + 0.5 * found.edge[:, None]), found.values)
 
 
-def test_nodes_of_equal_grids_become_one():
-    grid = parse("{ {1} {2} {3} {4} {5} {6} {7} {8} }", 3)
-    assert grid.shape == (2, 2, 2)
-    assert (grid[1, 0, 0], grid[0, 1, 0], grid[0, 0, 1]) == (2.0, 3.0, 5.0)
-    nodes = (" ".join(str(10 * node + place) for place in range(8)) for node in range(8))
-    twice = parse("{" + " ".join(f"{{ {node} }}" for node in nodes) + "}", 3)
-    assert twice.shape == (4, 4, 4)
-    assert twice[2, 1, 3] == 10 * 5 + 3  # node: first and last axis above the middle, 1 + 4; in it 0, 1, 1
-
-
-def test_a_million_values_in_seconds():
-    node = "{" + f"{{{' '.join(['0.123456'] * 16)}}} " * 16 + "}"
-    for _ in range(3):
-        node = "{" + node * 16 + "}"
-    assert boxes(parse(node, 4), 4).values.size == 16**5
-
-
 def test_the_disk_has_the_area_of_the_square():
     """Points on concentric squares land on concentric circles; the map keeps areas."""
     u, v = np.random.default_rng(0).random((2, 2000))
@@ -108,7 +89,6 @@ def test_the_disk_has_the_area_of_the_square():
 
 
 def test_an_isotropic_tree_by_hand(reading):
-    """In eight boxes: light at sin theta 0.5; the upper half of the first axis is empty."""
     data = reading(xml(3, ("{ {1} {0} {3} {0} {5} {0} {7} {0} }", {})))
     np.testing.assert_allclose(data.theta_i, 30.0)
     np.testing.assert_allclose(data.phi_i, 180.0)

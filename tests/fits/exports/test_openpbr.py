@@ -14,8 +14,7 @@ import layerjax as lj
 from fits.cli.parser import main
 from fits.exports.openpbr import surface as model
 from fits.exports.openpbr.document import inputs
-from fits.exports.openpbr.start import starts
-from fits.exports.openpbr.surface import EDGE, Surface, metal_reflectance
+from fits.exports.openpbr.surface import Surface
 from tests.helpers.commands import refused
 
 evaluate, albedo = eqx.filter_jit(model.evaluate), eqx.filter_jit(model.albedo)
@@ -85,46 +84,6 @@ def test_albedo_is_the_integral_over_light():
     weight = (np.sin(theta) * np.cos(theta)).ravel() * (np.pi / 128) * (np.pi / 32)
     whole = (evaluate(surface, wi, jnp.broadcast_to(towards(40.0), wi.shape)) * weight[:, None]).sum(axis=0)
     np.testing.assert_allclose(albedo(surface, towards(0.0, 30.0, 40.0, 80.0))[2], whole, rtol=1e-3)
-
-
-def test_known_limits():
-    # where all is reflected and hardly anything twice, a lobe is that of Walter et al. 2007
-    metal = Surface(("metal",), 1.0, base_metalness=1.0, specular_roughness=0.1)
-    conductor = lj.Stack([], lj.Conductor(0.01, 20.0, 0.01))
-    wi, wo = towards(0.0, 20.0, 40.0, 60.0), lj.direction(np.radians([1.0, 21.0, 39.0, 60.5]), 0.31 + np.pi)
-    true = lj.evaluate(conductor, wi, wo, lj.SingleScattering())
-    np.testing.assert_allclose(evaluate(metal, wi, wo), true, rtol=2e-3)
-    # a coat of no index is none
-    bare = Surface(("metal",), base_metalness=1.0, **METAL)
-    coated = Surface(("coat", "metal"), base_metalness=1.0, coat_ior=1.0, coat_roughness=0.01, **METAL)
-    np.testing.assert_allclose(evaluate(coated, wi, wo), evaluate(bare, wi, wo), rtol=1e-6)
-    # only what lies below a lobe breaks reciprocity
-    wo = lj.direction(np.radians([70.0, 20.0, 10.0, 50.0]), 2.0)
-    for surface, apart in ((Surface(("diffuse",), RED, 0.5), False), (Surface(("gloss", "diffuse"), RED), True)):
-        most = np.max(abs(evaluate(surface, wi, wo) / evaluate(surface, wo, wi) - 1.0))
-        assert most > 0.01 if apart else most < 1e-12
-    # a metal has its colours at 0 and 82 degrees
-    color, tint = jnp.array([0.9, 0.5]), jnp.array([0.8, 0.6])
-    np.testing.assert_allclose(metal_reflectance(jnp.ones(1), color, tint), color)
-    schlick = color + (1.0 - color) * (1.0 - EDGE) ** 5
-    np.testing.assert_allclose(metal_reflectance(jnp.array([EDGE]), color, tint), tint * schlick)
-
-
-def test_layers_say_where_the_fit_starts():
-    (metal,) = starts((lj.Stack([lj.Interface(1.5, 0.04)], COPPER),))
-    assert metal.lobes == ("coat", "metal")
-    n, k = np.array([0.2, 0.9, 1.1]) / 1.5, np.array([3.9, 2.4, 2.2]) / 1.5
-    np.testing.assert_allclose(metal.base_color, ((n - 1) ** 2 + k**2) / ((n + 1) ** 2 + k**2), rtol=1e-5)
-    assert (metal.coat_ior, metal.coat_roughness) == pytest.approx((1.5, 0.2))
-    assert metal.specular_roughness == pytest.approx(0.4)
-    (two,) = starts((lj.Stack([lj.Interface(1.3, 0.04), lj.Interface(1.6, 0.25)], lj.Lambertian(RED)),))
-    assert two.lobes == ("coat", "gloss", "diffuse")
-    assert (two.coat_ior, two.specular_ior, two.specular_roughness) == pytest.approx((1.3, 1.6, 0.5))
-    (one,) = starts((lj.Stack([lj.Interface(1.5, 0.04)], lj.Lambertian(RED)),))
-    assert one.lobes == ("gloss", "diffuse")
-    assert [one.lobes for one in starts((lj.gallery.stack("rough_copper"),))] == [("gloss", "diffuse"), ("metal",)]
-    flakes = lj.Stack([lj.Interface(1.5, 0.04), lj.Medium(1.0, phase=lj.SGGX("surface", 0.3))], lj.Lambertian(RED))
-    assert [one.lobes for one in starts((flakes,))] == [("coat", "gloss", "diffuse"), ("coat", "metal", "diffuse")]
 
 
 def read(path):

@@ -27,7 +27,6 @@ def measured(request, tmp_path_factory):
 
 
 def test_mitsuba_finds_the_stack(measured):
-    """To 1 %, 0.3 % in the median."""
     mi = pytest.importorskip("mitsuba")
     mi.set_variant("scalar_rgb")
     stack, transport, path = measured

@@ -8,13 +8,11 @@ from scipy.stats import qmc
 
 import fits
 import layerjax as lj
-from fits.data.geometry import Geometry
-from fits.data.measurements import Measurements
-from fits.maps.emulator import chebyshev, emulate, with_emulator
-from fits.maps.options import MapOptions
+from fits.maps.emulator import emulate, with_emulator
 from fits.problem.model import Model
+from tests.helpers.models import along
 
-ERROR = MapOptions.emulator_error
+ERROR = fits.MapOptions.emulator_error
 NOISE = fits.Noise(relative=0.02, floor=1e-4, discrepancy=False)
 NAMES = ("layers[0].thickness", "base.albedo[0]", "base.albedo[1]")
 TRUTH = 0.4, 0.3, 0.6
@@ -30,8 +28,7 @@ def haze(stack, wi, wo):
 def problem_of(transport):
     every = fits.slices(incidence=[10.0, 60.0])
     places = np.linspace(0, len(every.wi) - 1, 12).astype(int)
-    view, values = (every.wi[places], every.wo[places]), np.full((12, 2), 0.1)
-    data = Measurements(*view, values, None, np.ones(12, bool), ("one", "two"))
+    data = along(fits.Geometry(every.wi[places], every.wo[places]), 0.1, channels=("one", "two"))
     return fits.Problem(FREE, data, transport=transport, noise=NOISE, scale=fits.Free(1.0, 0.8, 1.25))
 
 
@@ -80,13 +77,8 @@ def test_derivatives_are_those_of_the_emulator(emulated, vectors):
     assert np.any(slopes[:, 0, first] != 0.0)
 
 
-def test_chebyshev_polynomials_are_cosines():
-    x = np.array([-1.0, -0.3, 0.0, 0.8, 1.0])
-    np.testing.assert_allclose(chebyshev(jnp.asarray(x), 6), np.cos(np.arange(6)[:, None] * np.arccos(x)), atol=1e-12)
-
-
 def test_too_dear_an_emulator_is_not_made(problem):
-    emulator, words = emulate(problem, MapOptions(emulator_max_solves=10))
+    emulator, words = emulate(problem, fits.MapOptions(emulator_max_solves=10))
     assert emulator is None
     assert "of 10 allowed" in words
 
@@ -96,7 +88,7 @@ def fitted(out, transport, **options):
     problem = problem_of(transport)
     exact = np.asarray(problem.predict(np.array([*TRUTH, 1.0])))
     values = exact * (1.0 + NOISE.relative * np.random.default_rng(2).standard_normal((6, *exact.shape)))
-    view, options = Geometry(problem.data.wi, problem.data.wo), MapOptions(starts=2, chunk_size=4, **options)
+    view, options = fits.Geometry(problem.data.wi, problem.data.wo), fits.MapOptions(starts=2, chunk_size=4, **options)
     return fits.fit_map(FREE, view, values, out, NOISE, transport=transport, options=options)
 
 

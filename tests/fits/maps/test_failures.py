@@ -98,7 +98,6 @@ def test_killed_at_random_moments(made, tmp_path, kills):
 
 @pytest.mark.slow
 def test_one_run_at_a_time_which_the_user_interrupts(made, tmp_path, capsys):
-    """Ctrl-C goes to all processes of a terminal."""
     folder, whole = made
     out = tmp_path / "coat.zarr"
     words = command(folder, out, "--processes", "2")

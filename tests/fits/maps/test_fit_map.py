@@ -12,17 +12,12 @@ from scipy.optimize import least_squares
 
 import fits
 import layerjax as lj
-from fits.data.geometry import Geometry
-from fits.data.measurements import Measurements
-from fits.maps.fit_map import tile
-from fits.maps.options import MapOptions
 from fits.maps.report import summarise, verdict
 from tests.helpers import quick_maps
 from tests.helpers.quick_maps import FREE, NAMES, NOISE, TRANSPORT, assert_same, fitted
 
 SHAPE = (8, 8)
-CLOSE = 2e-3
-"""Standard errors that a converged fit may be off by, times twenty: it has converged within 1e-4."""
+CLOSE = 2e-3  # standard errors that a converged fit may be off by, times twenty: it has converged within 1e-4
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +37,7 @@ def partial(tmp_path_factory, holes):
 
 def data_of(geometry, values):
     used = np.isfinite(values)
-    return Measurements(geometry.wi, geometry.wo, np.where(used, values, 0.0), None, used[:, 0], ("value",))
+    return fits.Measurements(geometry.wi, geometry.wo, np.where(used, values, 0.0), None, used[:, 0], ("value",))
 
 
 def distance(map, expected, where=Ellipsis, there=Ellipsis):
@@ -52,9 +47,6 @@ def distance(map, expected, where=Ellipsis, there=Ellipsis):
         for name in NAMES
     ]
     return float(np.nanmax(np.abs(moves)))
-
-
-# ---- what is found ----
 
 
 def test_every_texel_ends_where_scipy_does_and_others_are_flagged(partial, geometry, holes):
@@ -81,9 +73,10 @@ def test_every_texel_ends_where_scipy_does_and_others_are_flagged(partial, geome
     [
         {"noise": None},
         {"noise": None, "objective": "cosine_l2"},
+        {"noise": fits.Noise(relative=fits.Free(0.05, 1e-3, 0.5), floor=1e-4)},
         {"noise": NOISE, "instrument": fits.Instrument(detector_aperture=2.0, floor=1e-4, gain_sd=0.01)},
     ],
-    ids=["assumed noise", "named objective", "instrument"],
+    ids=["assumed noise", "named objective", "fitted noise", "instrument"],
 )
 def test_values_and_errors_are_those_of_a_fit(tmp_path, geometry, measured, options):
     map = fitted(tmp_path / "map.zarr", measured[3:4], **options)
@@ -95,8 +88,9 @@ def test_values_and_errors_are_those_of_a_fit(tmp_path, geometry, measured, opti
     for name in NAMES:
         assert map.errors[name][0, 5] == pytest.approx(one.standard_errors[name], rel=1e-3)
         assert named or abs(map.values[name][0, 5] - one.values[name]) < CLOSE * one.standard_errors[name]
-    assert named or map.reduced_chi_square[0, 5] == pytest.approx(one.reduced_chi_square, rel=1e-6)
-    is_assumed = list(options) == ["noise"]
+    close = 1e-3 if "noise.relative" in map.names else 1e-6  # a level that is fitted moves it to first order
+    assert named or map.reduced_chi_square[0, 5] == pytest.approx(one.reduced_chi_square, rel=close)
+    is_assumed = options == {"noise": None}
     assert map.attributes["noise_assumed"] is is_assumed
     assert ("No noise is stated: 5 %" in " ".join(verdict(summarise(map), map)[0])) == is_assumed
     assert (map.numerical_error is not None) == ("instrument" in options)
@@ -109,7 +103,7 @@ def test_every_texel_may_have_directions_of_its_own(tmp_path, geometry):
     wo = np.stack([geometry.wo @ tilt.T for tilt in tilts])
     keep = np.all(wo[..., 2] > 0.05, axis=0)
     wi, wo = np.stack([geometry.wi[keep]] * 4), wo[:, keep]
-    own = [Geometry(*pair) for pair in zip(wi, wo, strict=True)]
+    own = [fits.Geometry(*pair) for pair in zip(wi, wo, strict=True)]
     values = np.stack([quick_maps.seen(np.array([0.6, 0.5]), one) for one in own])
     noise = fits.Noise(relative=0.02, floor=1e-4)
     map = fitted(tmp_path / "own.zarr", values, view=(wi, wo), noise=noise)
@@ -130,17 +124,7 @@ def test_thresholds_of_flags_are_options(tmp_path, measured):
     thresholds = {"poor_probability": 0.5, "pilot_quantile": 0.0, "pilot_factor": 0.01}
     map = fitted(tmp_path / "map.zarr", measured, **thresholds, restarts=0)
     assert 0.2 < map.has("poor").sum() / map.has("fitted").sum() < 0.8
-    assert (map.option("poor_probability"), map.option("numerical_error")) == (0.5, MapOptions.numerical_error)
-
-
-# ---- maps of all kinds ----
-
-
-def test_chunks_are_as_square_as_the_map_allows():
-    assert tile((512, 512), 1024) == (32, 32)
-    assert tile((100,), 1024) == (100,)
-    assert tile((3, 5000), 1024) == (3, 341)
-    assert tile((4, 8, 8), 16) == (1, 4, 4)
+    assert (map.option("poor_probability"), map.option("numerical_error")) == (0.5, fits.MapOptions.numerical_error)
 
 
 @pytest.mark.parametrize(
@@ -229,9 +213,7 @@ def never_finite(stack, wi, wo):
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"starts": 0}, "starts: 0 is not a whole number of at least 1"),
         ({"poor_probability": 2.0}, r"poor_probability is 2.0; it must be a number in \[0, 1\]"),
-        ({"emulator_error": "small"}, r"emulator_error is 'small'; it must be a number in \[0, inf\]"),
         ({"noise": 0.02}, "noise: 0.02 is not a Noise or None"),
         ({"noise": fits.Noise(relative=0.02, discrepancy=True)}, "noise.discrepancy"),
         ({"instrument": fits.Instrument(tilt=fits.Free(0, -1, 1, same_for_all_texels=True))}, r"\.tilt is common"),

@@ -216,9 +216,6 @@ def test_only_blocks_are_read(tmp_path):
     assert data.fingerprint()
 
 
-# ---- directions ----
-
-
 @pytest.mark.parametrize("kind", ["zarr", "hdf5", "xarray"])
 @pytest.mark.parametrize("each", [False, True], ids=["common", "each"])
 def test_directions_may_stand_beside_the_values(tmp_path, kind, each):

@@ -21,8 +21,7 @@ from tests.helpers.painted_maps import ATTRIBUTES, FREEDOM, GOOD, NAMES, bounded
 SHAPE, CHUNK = (20, 30), (10, 10)
 PLACES = np.arange(600).reshape(SHAPE)
 RATIO = numbers(SHAPE)["reduced_chi_square"]
-FULL = 8
-"""Pictures of a map of three parameters: two of each, flags, chi-square."""
+FULL = 8  # pictures of a map of three parameters: two of each, flags, chi-square
 
 
 @pytest.fixture(scope="module")
@@ -45,9 +44,6 @@ def painted():
 @pytest.fixture(scope="module")
 def map(painted, tmp_path_factory):
     return stored(tmp_path_factory.mktemp("map") / "<coat> & co.zarr", painted, CHUNK, numerical={"error": 0.025})
-
-
-# ---- numbers, tables and sentences ----
 
 
 def test_counts_quartiles_and_the_verdict_are_those_of_the_arrays(map, painted):
@@ -150,9 +146,6 @@ def test_nearly_all_is_not_written_as_all():
         assert report.share(part, whole) == words
 
 
-# ---- the page ----
-
-
 SMOOTHING = {"prior": {"kind": "gaussian", "scale": dict.fromkeys(NAMES, 0.05)}, "rounds": 3, "settled": False}
 ROUNDS = "base.albedo 0.05), in 3 rounds; "
 
@@ -217,9 +210,6 @@ def test_the_command_writes_the_page_beside_the_store_or_says_why_not(tmp_path, 
         ("other.zarr", "is no store of a fitted map"),
     ):
         assert message in refused(["report", *words.split()], capsys, tmp_path)
-
-
-# ---- pictures ----
 
 
 def test_an_image_is_the_map_with_row_0_on_top_in_colours_over_the_middle():

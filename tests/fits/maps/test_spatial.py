@@ -18,12 +18,8 @@ from tests.helpers.quick_maps import NAMES, TRANSPORT, assert_same, coat
 SHAPE, CHUNK = (4, 4), 12  # the second chunk begins at an odd column
 THICKNESS, ALBEDO = NAMES
 LOW, HIGH = np.array([np.log(0.05), 0.0]), np.array([np.log(3.0), 1.0])
-MEAN, SD = 0.5, 0.2
-"""The prior of the albedo."""
-
-HUBER = 0.1
-"""Share of a scale below which a total variation is quadratic."""
-
+MEAN, SD = 0.5, 0.2  # the prior of the albedo
+HUBER = 0.1  # share of a scale below which a total variation is quadratic
 FREE = coat(fits.Free(0.5, 0.05, 3.0, prior=fits.LogUniform()), fits.Free(0.4, 0.0, 1.0, prior=fits.Normal(MEAN, SD)))
 SCALES = {"gaussian": np.array([0.03, 0.02]), "total_variation": np.array([0.09, 0.06])}
 """Those of a total variation, whose neighbours hold on to each other ten times as much, are wider: fewer rounds."""

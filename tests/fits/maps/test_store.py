@@ -34,9 +34,6 @@ def write(store, block):
     store.write(block, {name: values[block] for name, values in numbers(SHAPE).items()})
 
 
-# ---- what is written ----
-
-
 def test_what_is_written_is_read(map):
     arrays = numbers(SHAPE)
     for name in NAMES:
@@ -144,9 +141,6 @@ def test_what_is_no_such_store_is_refused(damage, words, map):
         open_map(map.path).smoothed[NAMES[0]]
     assert str(map.path) in str(caught.value)
     assert "\n" not in str(caught.value)
-
-
-# ---- whose map it is ----
 
 
 @pytest.mark.parametrize(

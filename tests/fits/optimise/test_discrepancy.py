@@ -5,32 +5,24 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks.measuring.repeats import fit_many
-from fits.data.geometry import slices
-from fits.data.measurements import Measurements
+from fits import Discrepancy, Free, Noise, Posterior, fit, load_fit, save_fit, slices
 from fits.optimise import multi_start as starts_module
-from fits.optimise.fit import fit, without_discrepancy
-from fits.problem.discrepancy import Discrepancy, log_scales, places
-from fits.problem.noise import Noise
-from fits.problem.parameters import Free
-from fits.problem.problem import Problem
+from fits.optimise.fit import without_discrepancy
+from fits.problem.discrepancy import log_scales, places
 from fits.reports import verdicts
-from fits.reports.results import load_fit, save_fit
-from fits.sampling.posterior import Posterior
-from tests.helpers.models import line
+from tests.helpers.models import along, line
 
 STACK = {"a": Free(0.9, 0.1, 3.0), "b": Free(0.1, -1.0, 3.0)}
 GEOMETRY = slices([10.0, 50.0], np.arange(-80.0, 81.0, 4.0))
+EXACT = np.asarray(line({"a": 1.0, "b": 0.5}, GEOMETRY.wi, GEOMETRY.wo))
 NOISE = Noise(relative=0.02, floor=1e-4)
 
 
-def readings(wave, seed=0):
+def readings(wave):
     """Of the line, times one plus a wave along the viewing angle, with noise of 2 %."""
-    exact = np.asarray(line({"a": 1.0, "b": 0.5}, GEOMETRY.wi, GEOMETRY.wo))
     angle = np.arctan2(GEOMETRY.wo[:, :1], GEOMETRY.wo[:, 2:])
-    noise = 0.02 * np.random.default_rng(seed).standard_normal(exact.shape)
-    values = exact * (1.0 + wave * np.sin(8.0 * angle) + noise)
-    return Measurements(GEOMETRY.wi, GEOMETRY.wo, values, None, np.ones(len(values), bool), ("value",))
+    noise = 0.02 * np.random.default_rng(0).standard_normal(EXACT.shape)
+    return along(GEOMETRY, EXACT * (1.0 + wave * np.sin(8.0 * angle) + noise))
 
 
 def fitted(wave=0.1, noise=NOISE, starts=2, **how):
@@ -54,15 +46,6 @@ def test_a_wrong_shape_is_fitted_with_them(wrong):
     assert 0.03 < wrong.values["noise.discrepancy.amplitude"] < 0.3
     for name in plain.values:
         assert wrong.standard_errors[name] > 2.0 * plain.standard_errors[name]
-
-
-def test_repeats_are_fitted_by_what_their_own_readings_tell():
-    """Where noise is a level, readings tell the less of their logarithms the smaller they are."""
-    data, noise = readings(0.1), Noise(relative=0.0, floor=0.05, discrepancy=Discrepancy(0.1, 10.0, 10.0, 0.0))
-    small = replace(data, values=0.2 * data.values)
-    by_others, by_themselves = (fit_many(Problem(STACK, one, line, noise), small.values[None]) for one in (data, small))
-    np.testing.assert_allclose(by_others.vectors, by_themselves.vectors, rtol=1e-6)
-    np.testing.assert_allclose(by_others.standard_errors, by_themselves.standard_errors, rtol=1e-6)
 
 
 def test_simulated_readings_share_errors(wrong):

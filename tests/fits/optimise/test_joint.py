@@ -7,27 +7,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from fits.any_report import report
-from fits.data.geometry import slices
-from fits.optimise.fit import fit
-from fits.prediction.compare import compare
-from fits.prediction.cross_validation import cross_validate
-from fits.prediction.importance import evidence
-from fits.prediction.predict import predict
-from fits.problem.discrepancy import Discrepancy
-from fits.problem.noise import Noise
-from fits.problem.parameters import Free, LogNormal, Normal, Uniform
-from fits.problem.problem import Joint, Problem
-from fits.reports.results import save_fit
-from fits.sampling.posterior import Posterior
-from fits.sampling.sample import sample
+import fits
 from tests.helpers.models import LINE, LOBE_STACK, design, line, lobe, measured, noisy_lobe
 
 SIGMA = {"first": 0.05, "second": 0.02}
 COUNTS = {"first": 100, "second": 40}
-TRUE = {"first": (1.0, 0.5), "second": (0.2, 0.5)}
-"""Two lines with one slope."""
-PRIOR = Normal(0.4, 0.01)
+TRUE = {"first": (1.0, 0.5), "second": (0.2, 0.5)}  # two lines with one slope
+PRIOR = fits.Normal(0.4, 0.01)
 SLOPE, OFFSET = "['b']", "['a']"
 
 
@@ -36,11 +22,11 @@ def data(name):
     return measured((design(COUNTS[name]) @ TRUE[name])[:, None] + SIGMA[name] * noise, SIGMA[name])
 
 
-FLAT = Uniform()
+FLAT = fits.Uniform()
 
 
 def problem(name, prior=FLAT):
-    return Problem({"a": Free(0.9, -1.0, 3.0), "b": Free(0.1, -1.0, 3.0, prior)}, data(name), line)
+    return fits.Problem({"a": fits.Free(0.9, -1.0, 3.0), "b": fits.Free(0.1, -1.0, 3.0, prior)}, data(name), line)
 
 
 def least_squares(prior):
@@ -62,7 +48,7 @@ def least_squares(prior):
 
 @pytest.fixture(scope="module")
 def joint():
-    return fit(Joint({name: problem(name) for name in TRUE}, shared=[SLOPE]), starts=2)
+    return fits.fit(fits.Joint({name: problem(name) for name in TRUE}, shared=[SLOPE]), starts=2)
 
 
 def order(found):
@@ -80,7 +66,7 @@ def test_it_is_least_squares(joint):
     assert joint.chi_square == pytest.approx(np.sum(residuals**2))
     assert joint.log_likelihood == pytest.approx(sum(joint.part(name).log_likelihood for name in TRUE))
     # the prior of what is shared counts once
-    found = fit(Joint({name: problem(name, PRIOR) for name in TRUE}, shared=[SLOPE]), starts=1)
+    found = fits.fit(fits.Joint({name: problem(name, PRIOR) for name in TRUE}, shared=[SLOPE]), starts=1)
     expected, covariance = least_squares(prior=True)
     np.testing.assert_allclose(found.vector[order(found)], expected, atol=1e-5)
     np.testing.assert_allclose(found.covariance[np.ix_(order(found), order(found))], covariance, rtol=1e-6)
@@ -100,20 +86,20 @@ def test_a_part_is_a_fit_of_its_own(joint):
 def test_what_takes_the_other_of_whole_and_part(joint):
     """What asks the data anew takes the whole, what shows or keeps one measurement a part."""
     first = joint.part("first")
-    for ask in (sample, evidence, cross_validate):
+    for ask in (fits.sample, fits.evidence, fits.cross_validate):
         with pytest.raises(ValueError, match=f"{ask.__name__}: 'first' is a part of a joint fit"):
             ask(first)
     with pytest.raises(ValueError, match="cross_validate: it takes a fit of one measurement by itself, not a joint"):
-        cross_validate(joint)
+        fits.cross_validate(joint)
     chain = np.tile(joint.vector, (20, 2, 1))
-    posterior = Posterior(joint, chain, chain[..., 0], np.ones(3), 1.0, converged=True)
+    posterior = fits.Posterior(joint, chain, chain[..., 0], np.ones(3), 1.0, converged=True)
     for ask in (
-        lambda: compare({"one": joint, "other": joint}),
+        lambda: fits.compare({"one": joint, "other": joint}),
         lambda: joint.scale,
         lambda: posterior.inference_data,
-        lambda: report(joint, path="never written"),
-        lambda: save_fit(joint, "never written"),
-        lambda: predict(joint, slices(incidence=(10,))),
+        lambda: fits.report(joint, path="never written"),
+        lambda: fits.save_fit(joint, "never written"),
+        lambda: fits.predict(joint, fits.slices(incidence=(10,))),
     ):
         with pytest.raises(ValueError, match=r"of a joint fit it takes a part: fit.part\(...\) of first, second"):
             ask()
@@ -121,8 +107,8 @@ def test_what_takes_the_other_of_whole_and_part(joint):
 
 
 def test_a_part_predicts_with_what_all_of_them_say(joint):
-    at = slices(incidence=(10,))
-    seen = predict(joint.part("first"), at, draws=4000)
+    at = fits.slices(incidence=(10,))
+    seen = fits.predict(joint.part("first"), at, draws=4000)
     columns = np.stack([at.wo[:, 2], np.ones(len(at)), np.zeros(len(at))], axis=-1)
     _, covariance = least_squares(prior=False)
     sd = np.sqrt(np.sum(columns @ covariance * columns, axis=-1))
@@ -130,7 +116,7 @@ def test_a_part_predicts_with_what_all_of_them_say(joint):
 
 
 def test_the_posterior_is_that_of_all(joint):
-    found = sample(joint, ess=1000, seed=1)
+    found = fits.sample(joint, ess=1000, seed=1)
     expected, covariance = least_squares(prior=False)
     summary, errors = [found.summary()[joint.problem.names[k]] for k in order(joint)], np.sqrt(np.diagonal(covariance))
     np.testing.assert_allclose([one[4] for one in summary], errors, rtol=0.12)
@@ -142,19 +128,23 @@ def test_the_posterior_is_that_of_all(joint):
 
 
 def test_measurements_that_share_nothing_are_each_alone():
-    """One with levels of noise that are fitted, one with errors that readings share."""
     values = design(60) @ [0.9, 0.4]
     noise = np.random.default_rng(3).standard_normal((2, 60)) * [[0.03], [0.05]]
     level, shared = (measured((values * (1 + part))[:, None]) for part in noise)
     problems = {
-        "level": Problem(LINE, level, line, Noise(relative=Free(0.1, 0.001, 1.0, LogNormal(0.05, 2.0)))),
-        "shared": Problem(
-            LINE, shared, line, Noise(relative=0.02, discrepancy=Discrepancy(length_half=10.0, length_difference=10.0))
+        "level": fits.Problem(
+            LINE, level, line, fits.Noise(relative=fits.Free(0.1, 0.001, 1.0, fits.LogNormal(0.05, 2.0)))
+        ),
+        "shared": fits.Problem(
+            LINE,
+            shared,
+            line,
+            fits.Noise(relative=0.02, discrepancy=fits.Discrepancy(length_half=10.0, length_difference=10.0)),
         ),
     }
-    together = fit(Joint(problems), starts=3)
+    together = fits.fit(fits.Joint(problems), starts=3)
     for name, one in problems.items():
-        alone = fit(LINE, one.data, transport=line, noise=one.noise, starts=3)
+        alone = fits.fit(LINE, one.data, transport=line, noise=one.noise, starts=3)
         np.testing.assert_allclose(together.part(name).vector, alone.vector, rtol=1e-4)
         np.testing.assert_allclose(together.part(name).errors, alone.errors, rtol=1e-3)
         np.testing.assert_allclose(together.part(name).residuals, alone.residuals, atol=1e-3)
@@ -162,8 +152,8 @@ def test_measurements_that_share_nothing_are_each_alone():
 
 def test_what_is_new_in_one_measurement_is_not_shared():
     """Errors that readings of one of them share have names that begin as those of levels of noise do."""
-    noise = Noise(relative=Free(0.1, 0.01, 1.0))
-    both = Joint({name: Problem(LINE, data(name), line, noise) for name in TRUE}, shared=["noise", SLOPE])
+    noise = fits.Noise(relative=fits.Free(0.1, 0.01, 1.0))
+    both = fits.Joint({name: fits.Problem(LINE, data(name), line, noise) for name in TRUE}, shared=["noise", SLOPE])
     changed = both.with_problems({"first": replace(both.parts["first"], noise=replace(noise, discrepancy=True))})
     added = set(changed.names) - set(both.names)
     assert len(added) == 4
@@ -176,8 +166,8 @@ def test_each_measurement_is_differentiated_by_its_own_parameters():
     def dear(stack, wi, wo):
         return sum(lobe(stack | {"gain": stack["gain"] * share}, wi, wo) for share in (0.05, 0.1, 0.15, 0.2))
 
-    alone = Problem(LOBE_STACK, noisy_lobe(0), dear)
-    several = Joint(dict.fromkeys(("a", "b", "c"), alone), shared=["['alpha']"])
+    alone = fits.Problem(LOBE_STACK, noisy_lobe(0), dear)
+    several = fits.Joint(dict.fromkeys(("a", "b", "c"), alone), shared=["['alpha']"])
 
     def jacobian(model):
         def value(vector):
@@ -195,21 +185,21 @@ def test_each_measurement_is_differentiated_by_its_own_parameters():
 
 
 FIRST, SECOND = (problem(name) for name in TRUE)
-FIXED = Problem({"a": Free(0.9, -1.0, 3.0), "b": 0.5}, data("second"), line)
-OTHER = Problem({"a": Free(0.9, -1.0, 3.0), "b": Free(0.1, -1.0, 2.0)}, data("second"), line)
-NAMED = Problem(LINE, data("second"), line, objective="cosine_l2")
+FIXED = fits.Problem({"a": fits.Free(0.9, -1.0, 3.0), "b": 0.5}, data("second"), line)
+OTHER = fits.Problem({"a": fits.Free(0.9, -1.0, 3.0), "b": fits.Free(0.1, -1.0, 2.0)}, data("second"), line)
+NAMED = fits.Problem(LINE, data("second"), line, objective="cosine_l2")
 
 
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda: Joint({"a": FIRST}), r"Joint.parts is \['a'\]; it must name at least two problems"),
-        (lambda: Joint({"a": FIRST, "b": SECOND}, ["scale"]), "no problem has a free parameter 'scale'"),
-        (lambda: Joint({"a": FIRST, "b": FIXED}, [SLOPE]), r"\['b'\] is not free in 'b'; it must be in every problem"),
-        (lambda: Joint({"a": FIRST, "b": OTHER}, [SLOPE]), r"\['b'\] has other bounds or another prior in 'b' than in"),
-        (lambda: Joint({"a": FIRST, "b": NAMED}), "objective is 'cosine_l2'; it must be 'likelihood'"),
-        (lambda: fit(Joint({"a": FIRST, "b": SECOND}), data("first")), "data is given beside a Joint"),
-        (lambda: fit(Joint({"a": FIRST, "b": SECOND}), transport=line), "transport is given beside a Joint"),
+        (lambda: fits.Joint({"a": FIRST}), r"Joint.parts is \['a'\]; it must name at least two problems"),
+        (lambda: fits.Joint({"a": FIRST, "b": SECOND}, ["scale"]), "no problem has a free parameter 'scale'"),
+        (lambda: fits.Joint({"a": FIRST, "b": FIXED}, [SLOPE]), r"\['b'\] is not free in 'b'; it must be in every"),
+        (lambda: fits.Joint({"a": FIRST, "b": OTHER}, [SLOPE]), r"\['b'\] has other bounds or another prior in 'b'"),
+        (lambda: fits.Joint({"a": FIRST, "b": NAMED}), "objective is 'cosine_l2'; it must be 'likelihood'"),
+        (lambda: fits.fit(fits.Joint({"a": FIRST, "b": SECOND}), data("first")), "data is given beside a Joint"),
+        (lambda: fits.fit(fits.Joint({"a": FIRST, "b": SECOND}), transport=line), "transport is given beside a Joint"),
     ],
 )
 def test_refused(call, message):

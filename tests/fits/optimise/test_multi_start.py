@@ -6,24 +6,15 @@ import numpy as np
 import pytest
 
 import layerjax as lj
-from fits.data.geometry import slices
-from fits.data.reading import read
+from fits import Free, LogUniform, Noise, Problem, fit, read, read_problem, simulate, slices
 from fits.optimise import multi_start as starts_module
-from fits.optimise.fit import fit
 from fits.optimise.levenberg_marquardt import evaluate_at
 from fits.optimise.multi_start import LEAST_GAIN, multi_start, start_points, starts_store, unit_of
 from fits.optimise.result import OUTCOMES
-from fits.problem.noise import Noise
-from fits.problem.parameters import Free, LogUniform
-from fits.problem.problem import Problem
-from fits.problem.simulate import simulate
-from fits.problem.stack_file import read_problem
 from tests.helpers.models import LINE, LOBE, LOBE_STACK, directions, line, line_data, lobe, measured, noisy_lobe
-from tests.helpers.places import EXAMPLES
+from tests.helpers.places import COATINGS, EXAMPLES
 
-COATINGS = EXAMPLES / "arizona_black_coatings"
-
-STEEL = "nite_on_blasted_steel1008_650nm_inplane.csv"
+STEEL = COATINGS / "nite_on_blasted_steel1008_650nm_inplane.csv"
 
 
 def cost_at(problem, values):
@@ -35,7 +26,7 @@ def cost_at(problem, values):
 @pytest.mark.slow
 def test_a_stack_never_ends_above_what_it_contains():
     """A haze over flakes on paint: the flakes on paint, beside steel."""
-    data, ends = read(COATINGS / STEEL).select(incidence=(10.0, 50.0)), {}
+    data, ends = read(STEEL).select(incidence=(10.0, 50.0)), {}
     for name in ("hazy_coat_over_diffuse", "flake_coat_over_diffuse"):
         given = read_problem(EXAMPLES / f"{name}.toml")
         # the cheapest transport: what is asked is about starts, whatever carries the light
@@ -50,16 +41,13 @@ def test_a_stack_never_ends_above_what_it_contains():
 def test_a_race_ends_where_all_starts_do(monkeypatch):
     """Of a stack with several minima; few steps tell which starts go on, and the others are not followed."""
     given = read_problem(EXAMPLES / "hazy_coat_over_diffuse.toml")
-    data = read(COATINGS / STEEL).select(incidence=(10.0, 50.0))
+    data = read(STEEL).select(incidence=(10.0, 50.0))
     problem = Problem(given.stack, data, lj.SingleScattering(), replace(given.noise, discrepancy=False), given.scale)
     points = starts_module.start_points(problem, 8, 0)
     monkeypatch.setattr(starts_module, "EARLY", 10)
     ends = starts_module.screened_starts(problem, points)
     every = multi_start(problem, points, lambda *_: None)
     assert min(end.cost for end in ends) <= min(end.cost for end in every) + LEAST_GAIN
-    left = [end for end in ends if end.max_steps_reached]
-    assert 1 <= len(left) <= len(points) - starts_module.FRONT
-    assert {end.steps for end in left} == {20}  # with sigma held, and free
     assert sum(end.steps for end in ends) < sum(end.steps for end in every)
 
 
@@ -79,7 +67,6 @@ def test_the_lowest_end_is_the_fit_though_it_ran_out_of_steps(monkeypatch):
 
 
 def test_a_start_that_ran_out_of_steps_goes_on(monkeypatch):
-    """Two steps a round, and as many rounds as it takes: the same minimum."""
     monkeypatch.setattr(starts_module, "MOST_STEPS", 2)
     monkeypatch.setattr(starts_module, "MOST_ROUNDS", 200)
     slowly = fit(LOBE_STACK, noisy_lobe(0), transport=lambda *a: lobe(*a), starts=1)
@@ -87,20 +74,6 @@ def test_a_start_that_ran_out_of_steps_goes_on(monkeypatch):
     at_once = fit(LOBE_STACK, noisy_lobe(0), transport=lobe, starts=1)
     assert slowly.converged
     assert slowly.minima[0].cost == pytest.approx(at_once.minima[0].cost, abs=LEAST_GAIN)
-
-
-class Dimmed:
-    """A transport that shows as an object in memory."""
-
-    def __call__(self, stack, wi, wo):
-        return 0.5 * line(stack, wi, wo)
-
-
-def test_starts_are_known_again_by_a_process_with_the_transport_elsewhere_in_memory(tmp_path, monkeypatch):
-    transports = Dimmed(), Dimmed()  # both at once, so that they differ in place
-    fit(LINE, line_data(), transport=transports[0], starts=2, checkpoint=tmp_path / "starts")
-    monkeypatch.setattr(starts_module, "rough_descent", None)  # no start is run again
-    fit(LINE, line_data(), transport=transports[1], starts=2, checkpoint=tmp_path / "starts")
 
 
 def test_starts_are_those_of_the_same_fit_only(tmp_path):

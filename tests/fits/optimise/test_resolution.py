@@ -6,16 +6,11 @@ import numpy as np
 import pytest
 
 import layerjax as lj
-from fits.data.geometry import slices
+from fits import Free, Noise, Problem, fit, simulate, slices
 from fits.optimise import multi_start as starts_module
 from fits.optimise import resolution as resolution_module
-from fits.optimise.fit import fit
 from fits.optimise.options import DEFAULT
 from fits.optimise.resolution import LEAST_SCATTER, resolutions, spread
-from fits.problem.noise import Noise
-from fits.problem.parameters import Free
-from fits.problem.problem import Problem
-from fits.problem.simulate import simulate
 from fits.reports import results, verdicts
 from tests.helpers.models import LINE, TRUTH, line, line_data
 
@@ -122,29 +117,6 @@ def test_what_auto_is_does_not_follow_from_the_start():
     assert passing.chosen.nodes > passing.far.nodes == resolution_module.FAR["nodes"]
     bare = lj.Stack([lj.Medium(thickness=Free(0.0, 0.0, 1.0), albedo=0.0)], base=lj.Lambertian(albedo=0.5))
     assert resolutions(Problem(bare, data)) is None
-
-
-def test_modes_are_refined_alone_where_nodes_will_do(monkeypatch):
-    """What is as fine as it gets stays, and the other goes on."""
-    here = lj.AddingDoubling(nodes=12, modes=18, ordinates=(6, 8))
-    known = resolution_module.Resolutions(lj.AddingDoubling(), here, tilted=False)
-    finer = known.finer(here)
-    assert known.in_words(finer) == "16 nodes, 24 modes"
-    assert list(map(known.in_words, known.partly_finer(here, finer))) == ["12 nodes, 24 modes", "16 nodes, 18 modes"]
-    monkeypatch.setattr(resolution_module, "FINEST_NODES", 12)
-    only = known.finer(here)
-    assert known.in_words(only) == "12 nodes, 24 modes"
-    assert known.partly_finer(here, only) == []
-
-    def error(transport, other):
-        """Of a model that nodes change nothing of: it falls with the modes."""
-        return abs(36 - transport.modes) / 36 if transport.modes != other.modes else 0.0
-
-    monkeypatch.undo()
-    needed, error, finest = resolution_module.needed_resolution(known, here, error, DEFAULT.numerical_error)
-    assert (needed.nodes, finest) == (12, False)
-    assert needed.modes > 30
-    assert error <= DEFAULT.numerical_error
 
 
 def test_what_is_given_in_part_stays():

@@ -1,20 +1,14 @@
-"""Totals in a likelihood: against closed forms of slabs, and beside values along directions."""
+"""Totals: slabs in closed form, beside values along directions, and through integrating spheres, against the sum over
+all ways that light goes between wall, ports and sample."""
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.special import expn
 
 import layerjax as lj
-from fits.data.geometry import slices
-from fits.data.totals import Totals
-from fits.optimise.fit import fit
-from fits.problem.instrument import Instrument
-from fits.problem.noise import Noise
-from fits.problem.parameters import Free
-from fits.problem.problem import Joint, Problem
-from fits.problem.simulate import simulate
+from fits import Free, Instrument, Joint, Noise, Problem, Sphere, Spheres, Totals, fit, simulate, slices
+from fits.data.spheres import Shares
 
 SINGLE = lj.SingleScattering()
 ANGLES = np.array([0.0, 60.0])
@@ -68,28 +62,6 @@ def test_totals_and_values_together_tell_more_than_either():
     np.testing.assert_allclose((first + second) / np.outer(size, size), both / np.outer(size, size), atol=0.05)
 
 
-@pytest.mark.slow
-def test_a_total_costs_as_much_as_some_twenty_readings():
-    """By operations: the solver knows the flux; what is left is the same solve, read off tables."""
-    solver = lj.AddingDoubling(nodes=12, modes=16)
-    stack = lj.Stack(
-        [lj.Interface(1.5, 0.2), lj.Medium(DEPTH, 0.9, lj.HenyeyGreenstein(0.5))], lj.Lambertian(Free(0.3, 0.0, 1.0))
-    )
-    view = slices((10,), np.linspace(-80, 80, 20))
-    paint = lj.Stack([], lj.Lambertian(0.3))
-    readings = Problem(stack, simulate(paint, view, transport=SINGLE, noise=0.05), solver)
-    totals = Problem(stack, Totals.of(10.0, reflectance=0.3), solver)
-
-    def flops(problem):
-        return (
-            jax.jit(lambda vector: problem.model.predict(vector))
-            .lower(jnp.asarray(problem.start))
-            .cost_analysis()["flops"]
-        )
-
-    assert flops(totals) < 1.5 * flops(readings)
-
-
 def test_bad_totals_are_named():
     for wrong, words in (
         ({}, "give reflectance, transmittance or unscattered"),
@@ -101,8 +73,121 @@ def test_bad_totals_are_named():
     ):
         with pytest.raises(ValueError, match=words):
             Totals.of(**wrong)
-    given = Totals.of(reflectance=0.5)
-    with pytest.raises(ValueError, match="instrument is given, but the data are totals"):
-        Problem(lj.Stack([], lj.Lambertian(Free(0.5, 0.0, 1.0))), given, instrument=Instrument(detector_aperture=1.0))
-    with pytest.raises(ValueError, match=r"noise\.discrepancy is given, but the data are totals"):
-        Problem(lj.Stack([], lj.Lambertian(Free(0.5, 0.0, 1.0))), given, noise=Noise(discrepancy=True))
+    stack, given = lj.Stack([], lj.Lambertian(Free(0.5, 0.0, 1.0))), Totals.of(reflectance=0.5)
+    for more in ({"instrument": Instrument(detector_aperture=1.0)}, {"noise": Noise(discrepancy=True)}):
+        with pytest.raises(ValueError, match=rf"{next(iter(more))}.* is given, but the data are totals"):
+            Problem(stack, given, **more)
+
+
+FRONT = Sphere(100.0, 30.0, 15.0, 10.0, 0.95, 0.1)
+BEHIND = Sphere(80.0, 30.0, 0.0, 12.0, 0.97)
+OF = Shares(0.4, 0.35, 0.5, 0.45, 0.3, 0.28)
+
+
+def detected(spheres: tuple[Sphere, Sphere | None], of: Shares) -> np.ndarray:
+    """Light of a beam on the detectors of both spheres, by a chain of states that is followed to its end.
+
+    Light in a sphere is either just sent off by the sample or the detector, which a baffle keeps from each other (some
+    leaves by the entrance, the wall gets the rest), or sent off by the wall, and goes to all parts by their areas.
+    """
+    n = 4  # sent off by a port, by the wall; of the first sphere, of the second
+    moves, found = np.zeros((n, n)), np.zeros((2, n))
+    for k, sphere in enumerate(spheres):
+        if sphere is None:
+            continue
+        port, wall, other = 2 * k, 2 * k + 1, 2 * (1 - k)
+        reflected = (of.diffuse_reflected, of.diffuse_reflected_behind)[k]
+        passed = (of.diffuse_transmitted, of.diffuse_transmitted_up)[k]
+        areas = {name: sphere.area_fraction(name) for name in ("sample", "entrance", "detector")}
+        moves[wall, port] = (1.0 - areas["entrance"]) * sphere.wall
+        moves[wall, wall] = (1.0 - sum(areas.values())) * sphere.wall
+        moves[port, wall] = areas["sample"] * reflected + areas["detector"] * sphere.detector_reflectance
+        moves[other, wall] = areas["sample"] * passed
+        found[k, wall] = areas["detector"]
+    light = np.array([of.reflected, 0.0, of.transmitted, 0.0])
+    total = np.zeros(2)
+    while light.max() > 1e-18:
+        total += found @ light
+        light = moves @ light
+    return total
+
+
+@pytest.mark.parametrize("together", [True, False])
+def test_two_spheres_exchange_light_where_they_stand_together(together) -> None:
+    spheres = Spheres(FRONT, BEHIND, standard=0.98, together=together)
+    exchanged = float(together)
+    plate, nothing = Shares(0.98, 0.0, 0.98, 0.0, 0.0, 0.0), Shares(0.0, 1.0, 0.0, 0.0, exchanged, exchanged)
+    sample = OF if together else OF._replace(diffuse_transmitted=0.0, diffuse_transmitted_up=0.0)
+    both = (FRONT, BEHIND)
+    expected = detected(both, sample) / [detected(both, plate)[0] / 0.98, detected(both, nothing)[1]]
+    np.testing.assert_allclose(spheres.measured(OF), expected, rtol=1e-12)
+    many = spheres.measured(Shares(*(jnp.full(3, share) for share in OF)))
+    np.testing.assert_allclose(many, np.tile(expected[:, None], 3), rtol=1e-12)
+    if not together:
+        np.testing.assert_allclose(Spheres(FRONT, None, 0.98).measured(OF), [expected[0], OF.transmitted])
+        np.testing.assert_allclose(Spheres().measured(OF), [OF.reflected, OF.transmitted])
+
+
+def test_an_absorbing_slab_is_seen_by_diffuse_light_through_e3() -> None:
+    depth = 0.7
+    spheres = Spheres(FRONT, BEHIND, together=True)
+    totals = Totals.of(0.0, reflectance=0.1, transmittance=0.5, spheres=spheres)
+    problem = Problem(lj.Stack([lj.Medium(Free(depth, 0.1, 2.0), 0.0)]), totals, lj.SingleScattering())
+    passed = 2.0 * expn(3, depth)
+    expected = spheres.measured(Shares(0.0, np.exp(-depth), 0.0, 0.0, passed, passed))
+    np.testing.assert_allclose(np.ravel(problem.predict([depth])), expected, rtol=1e-4)
+
+
+def test_what_is_opaque_reflects_diffuse_light() -> None:
+    spheres = Spheres(FRONT, standard=0.98)
+    totals = Totals.of(8.0, reflectance=0.5, spheres=spheres)
+    problem = Problem(lj.Stack([], lj.Lambertian(Free(0.5, 0.0, 1.0))), totals, lj.SingleScattering())
+    for albedo in (0.0, 0.3, 1.0):
+        expected, _ = spheres.measured(Shares(albedo, 0.0, albedo, 0.0, 0.0, 0.0))
+        np.testing.assert_allclose(problem.predict([albedo])[0, 0], expected, rtol=1e-6, atol=1e-12)
+
+
+@pytest.mark.slow
+def test_light_from_behind_meets_the_other_face() -> None:
+    """A slab that is dark on one side: only the sphere there sees it."""
+    grey, white = lj.Medium(0.5, 0.2), lj.Medium(Free(1.0, 0.1, 5.0), 0.999)
+    solver = lj.AddingDoubling(nodes=8, modes=1)
+
+    def predicted(layers, spheres):
+        totals = Totals.of(0.0, transmittance=0.5, spheres=spheres)
+        return float(Problem(lj.Stack(layers), totals, solver).predict([1.0])[0, 0])
+
+    gains = [
+        predicted(layers, Spheres(None, BEHIND)) / predicted(layers, None) for layers in ([grey, white], [white, grey])
+    ]
+    assert gains[0] > 1.02 * gains[1]
+
+
+@pytest.mark.slow
+def test_coefficients_are_recovered_through_spheres() -> None:
+    spheres = Spheres(FRONT, BEHIND, standard=0.98, together=True)
+    slab = lj.Stack([lj.TurbidMedium(1.0, Free(2.0, 0.1, 50.0), Free(0.5, 1e-3, 5.0), lj.HenyeyGreenstein(0.5))])
+    solver = lj.AddingDoubling(nodes=8, modes=1)
+
+    def totals(values: np.ndarray, seen: Spheres | None) -> Totals:
+        return Totals.of(0.0, reflectance=values[0], transmittance=values[1], sigma=0.001, spheres=seen)
+
+    exact = np.ravel(Problem(slab, totals(np.array([0.2, 0.3]), spheres), solver).predict([5.0, 0.2]))
+    found, blind = (fit(slab, totals(exact, seen), transport=solver, starts=2) for seen in (spheres, None))
+    np.testing.assert_allclose(list(found.values.values()), [5.0, 0.2], rtol=1e-4)
+    assert abs(blind.values["layers[0].mu_a"] / 0.2 - 1.0) > 0.05
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Sphere(0.0, 0.0), "Sphere.diameter is 0.0, must be a number in"),
+        (lambda: Sphere(100.0, 99.999, 95.0, 95.0), "the ports cover the whole wall"),
+        (lambda: Sphere(100.0, 10.0, wall=1.0), r"Sphere.wall is 1.0, must be a number in \[0, 1\)"),
+        (lambda: Spheres(FRONT, standard=0.0), r"Spheres.standard is 0.0, must be in \(0, 1\]"),
+        (lambda: Spheres(FRONT, together=True), "Spheres.together: there is only one sphere"),
+    ],
+)
+def test_bad_spheres(make, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        make()

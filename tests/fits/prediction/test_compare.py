@@ -6,11 +6,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from fits.optimise.fit import fit
-from fits.prediction.compare import compare
+from fits import ComparisonOptions, Free, compare, fit
 from fits.prediction.cross_validation import groups_of
-from fits.prediction.options import ComparisonOptions
-from fits.problem.parameters import Free
 from tests.helpers.models import design, line, measured
 
 COUNT = 120
@@ -69,13 +66,14 @@ def test_what_differs_is_said_or_refused(fits: dict) -> None:
     notes = compare({"line": fits["line"], "scaled": scaled}).notes
     assert any(note.startswith("the fits differ in scale") for note in notes)
     other = fit(LINE, measured(DATA.values + 0.01, 0.05), transport=line, starts=1)
-    with pytest.raises(ValueError, match="'line' and 'other' were fitted to different data"):
-        compare({"line": fits["line"], "other": other})
     named = fit(LINE, DATA, transport=line, objective="log1p_cos", starts=1)
-    with pytest.raises(ValueError, match="only fits of one objective"):
-        compare({"line": fits["line"], "named": named})
-    with pytest.raises(ValueError, match="at least 2"):
-        compare({"line": fits["line"]})
+    for more, message in (
+        ({"other": other}, "'line' and 'other' were fitted to different data"),
+        ({"named": named}, "only fits of one objective"),
+        ({}, "at least 2"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            compare({"line": fits["line"]} | more)
     both = compare({"a": named, "b": named})
     assert both.sorted_by == "chi_square"
     assert math.isnan(both.rows[0].aic)
@@ -86,6 +84,3 @@ def test_thresholds_are_options(fits: dict) -> None:
     assert "line and flat are statistically indistinguishable" in comparison.verdict
     assert comparison.options.slight_difference == 1e6
     assert len(groups_of(DATA, ComparisonOptions(min_incidences=10**6, scan_parts=2))) <= 2
-    for bad, message in (({"clear_difference": 0.0}, r"a number in \(0, inf\)"), ({"scan_parts": 1}, "of at least 2")):
-        with pytest.raises(ValueError, match=rf"{next(iter(bad))}.* is .*{message}"):
-            ComparisonOptions(**bad)

@@ -9,25 +9,10 @@ import pytest
 from scipy import stats
 from scipy.special import logsumexp
 
-from fits.data.geometry import slices
-from fits.data.measurements import Measurements
-from fits.optimise.fit import fit
-from fits.optimise.result import Fit
-from fits.prediction.average import average
-from fits.prediction.compare import compare
-from fits.prediction.cross_validation import (
-    CrossValidation,
-    cross_validate,
-    rank_models,
-    stacking,
-    without,
-)
+from fits import ComparisonOptions, Fit, Measurements, Noise, Problem, average, compare, fit, predict, slices
+from fits.prediction.cross_validation import CrossValidation, cross_validate, rank_models, stacking, without
 from fits.prediction.importance import Evidence, evidence, posterior_draws
-from fits.prediction.options import ComparisonOptions
-from fits.prediction.predict import predict
-from fits.problem.noise import Noise
 from fits.problem.parameters import Free, LogUniform, Normal
-from fits.problem.problem import Problem
 from fits.reports import tables
 from fits.sampling import initial
 from tests.helpers.models import along, line
@@ -36,8 +21,6 @@ SIGMA = 0.05
 GEOMETRY = slices([10.0, 30.0, 50.0], np.arange(-75.0, 76.0, 10.0))
 STACK = {"a": Free(0.9, -4.0, 6.0, Normal(1.0, 0.5)), "b": Free(0.1, -4.0, 5.0, Normal(0.5, 0.4))}
 FLAT = {"a": Free(0.9, -4.0, 6.0, Normal(1.0, 0.5)), "b": 0.0}
-
-
 EXACT = np.asarray(line({"a": 1.0, "b": 0.5}, GEOMETRY.wi, GEOMETRY.wo))
 COLUMNS = np.stack([np.ones(len(GEOMETRY)), GEOMETRY.wo[:, 2]], axis=-1)
 DATA = along(GEOMETRY, EXACT + SIGMA * np.random.default_rng(0).standard_normal(EXACT.shape), SIGMA)

@@ -6,18 +6,10 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from fits.data.geometry import slices
-from fits.data.measurements import Measurements
+from fits import Discrepancy, Fit, Free, Measurements, Noise, Problem, fit, predict, sample, scores, slices
 from fits.data.scans import select
-from fits.optimise.fit import fit
-from fits.optimise.result import Fit
-from fits.prediction.predict import LEVELS, predict, scores
-from fits.problem.discrepancy import Discrepancy
-from fits.problem.noise import Noise
-from fits.problem.parameters import Free
-from fits.problem.problem import Problem
+from fits.prediction.predict import LEVELS
 from fits.reports.tables import UNRELIABLE, scores_table
-from fits.sampling.sample import sample
 from tests.helpers.models import COUNT, along, design, directions, drawn_discrepancy, line, line_fit, measured
 
 STACK = {"a": Free(0.9, 0.1, 3.0), "b": Free(0.1, -1.0, 3.0)}
@@ -84,7 +76,7 @@ def test_wrong_models_need_a_discrepancy() -> None:
     assert np.mean([one.elpd - other.elpd for one, other in zip(with_it, alone, strict=True)]) > 1.0
 
 
-def test_quantiles_are_those_of_the_draws() -> None:
+def test_quantiles_are_those_of_the_draws_and_hold_what_they_say() -> None:
     fitted, held_out = split(measurements(3, 0.1))
     at = predict(fitted_to(fitted), held_out)
     assert not np.array_equal(at.mean, at.latent.mean)
@@ -99,53 +91,17 @@ def test_quantiles_are_those_of_the_draws() -> None:
     expected = np.mean((held_out.used().values > low) & (held_out.used().values < high))
     assert at.scores.coverage[0.95] == pytest.approx(expected)
     assert at.scores == scores(at, held_out)
-
-
-def test_thirty_held_out_measurements_lie_within_what_is_predicted_and_not_within_the_stack() -> None:
-    """The 95 % of a stack that is wrong by 10 % held 18 of 30; those of the BSDF with its discrepancy, which `mean`,
-    `sd` and `quantile` give, and those of a measurement hold what they say."""
-    fitted, held_out = split(measurements(3, 0.1))
-    thirty = np.zeros(len(held_out), bool)
-    thirty[np.flatnonzero(held_out.mask)[np.linspace(0, 81, 30).astype(int)]] = True
-    held_out = held_out.where(thirty)
-    noise = Noise(relative=SIGMA, floor=1e-4, discrepancy=True)
-    at = predict(fit(STACK, fitted, transport=line, noise=noise, starts=2), held_out)
-    values = held_out.used().values
-    assert len(values) == 30
-
-    def inside(low: np.ndarray, high: np.ndarray) -> int:
-        return int(np.sum((low < values) & (values < high)))
-
-    assert inside(*at.latent.quantiles[[0, -1]]) <= 18
-    assert inside(at.quantile(0.025), at.quantile(0.975)) >= 27
-    assert inside(*at.predictive.quantiles[[0, -1]]) >= 27
-    assert at.scores.coverage[0.95] >= 27 / 30
-
-
-@pytest.mark.slow
-def test_what_is_predicted_first_is_the_bsdf_and_not_the_stack_alone() -> None:
-    """The truth is known: a stack that is wrong by 10 %, smoothly in angle. Its intervals hold that, 95 of 100."""
-    inside: dict[str, list[float]] = {"bsdf": [], "latent": []}
-    closer = []
-    for seed in range(2):
-        fitted, _ = split(measurements(seed, 0.1))
-        _, truth = split(measurements(seed, 0.1, sigma=0.0))  # the discrepancy is drawn before the noise
-        at = predict(fitted_to(fitted), truth)
-        exact = truth.used().values
-        for name, held in inside.items():
-            interval = getattr(at, name)
-            held.append(float(np.mean((interval.quantiles[0] < exact) & (exact < interval.quantiles[-1]))))
-        # a measurement adds independent noise: of the logarithm, which is the relative deviation here
-        np.testing.assert_allclose(at.scales**2, at.discrepancy_sd**2 + SIGMA**2, rtol=1e-3)
-        closer.append(np.median(np.abs(at.mean / exact - 1.0)) / np.median(np.abs(at.latent.mean / exact - 1.0)))
-    # neighbours are correlated: 82 count as some ten, whose share scatters by 0.07, the mean of 2 by 0.05
-    assert np.mean(inside["bsdf"]) > 0.85
-    assert np.mean(inside["latent"]) < 0.7
-    assert np.mean(closer) < 0.9
+    assert expected > 0.9
+    # the truth is known, as the discrepancy is drawn before the noise: of a stack that is wrong by 10 % the interval
+    # holds few of it, that of the BSDF, with its discrepancy, what it says
+    truth = split(measurements(3, 0.1, sigma=0.0))[1].used().values
+    within = [np.mean((of.quantiles[0] < truth) & (truth < of.quantiles[-1])) for of in (at.latent, at.bsdf)]
+    assert within[0] < 0.6
+    assert within[1] > 0.85
+    assert np.median(np.abs(at.mean / truth - 1.0)) < 0.9 * np.median(np.abs(at.latent.mean / truth - 1.0))
 
 
 def test_directions_below_an_opaque_stack_are_refused(coat_fit: Fit) -> None:
-    """There is nothing to see: whatever number stands there is made up."""
     for at in (slices([95.0]), slices([90.0]), slices([30.0], [10.0, 120.0])):
         with pytest.raises(ValueError, match=r"sees nothing of an opaque stack; its polar angle must be in \[0, 90\)"):
             predict(coat_fit, at)

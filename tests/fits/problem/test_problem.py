@@ -11,16 +11,8 @@ import pytest
 from scipy import integrate, stats
 
 import layerjax as lj
-from fits.problem.noise import (
-    Noise,
-    information_weights,
-    log_density,
-    named_residual,
-    tail_residual,
-)
-from fits.problem.parameters import Free, LogNormal, LogUniform, Normal
-from fits.problem.problem import Problem
-from fits.problem.simulate import simulate, slices
+from fits import Free, LogNormal, LogUniform, Noise, Normal, Problem, simulate, slices
+from fits.problem.noise import information_weights, log_density, named_residual, tail_residual
 from tests.helpers.models import design, line, measured
 
 COUNT = 40
@@ -31,9 +23,6 @@ NU = jnp.asarray(4.0)
 TAILS = {"gaussian": stats.norm, "student": stats.t(4.0)}
 PAINT = lj.Stack([], lj.Lambertian(Free(0.4, 0.0, 1.0)))
 DATA = simulate(lj.Stack([], lj.Lambertian(0.6)), slices(incidence=[20], outgoing=[-40, 10, 70]), noise=0.1)
-
-
-# ---- noise ----
 
 
 @pytest.mark.parametrize("z", [0.0, 1e-12, -1e-5, 0.019, 0.0201, -0.3, 2.0, 40.0, 1e6])
@@ -135,9 +124,6 @@ def test_named_residuals() -> None:
         assert np.all(np.isfinite(slope(jnp.asarray(predicted))))
 
 
-# ---- what stands for a transport, and what follows from a problem ----
-
-
 def lambert(stack: lj.Stack, wi: jax.Array, wo: jax.Array, gain: float = 1.0) -> jax.Array:
     return jnp.broadcast_to(gain * stack.base.albedo / jnp.pi, (len(wi), 1))
 
@@ -196,12 +182,10 @@ LINE_DATA = measured(VALUES)
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda: Noise(relative=-0.1), "Noise.relative is -0.1"),
         (lambda: Noise(floor=Free(0.1, 0.0, 1.0)), r"Noise.floor.low is 0.0; it must be a number in \[1e-100, "),
         (lambda: Noise(relative=Free([0.1, 0.1], 0.0, 1.0)), "Noise.relative has 2 channels"),
         (lambda: Noise(floor=1e-200), r"Noise.floor is 1e-200; it must be a number in \[1e-100, 1e\+100\]"),
         (lambda: Noise(relative=Free(0.5, 0.0, 5.0)), r"Noise.relative.high is 5.0; it must be a number in \[0, 1\]"),
-        (lambda: Noise(degrees_of_freedom=0.0), "Noise.degrees_of_freedom is 0.0"),
         (lambda: Noise(tails="cauchy"), "Noise.tails: 'cauchy' is not one of 'gaussian', 'student'"),
         (lambda: Problem({"a": 0.1, "b": 0.2}, LINE_DATA, line), "nothing is free"),
         (lambda: Problem(STACK, measured(VALUES, mask=np.zeros(COUNT, bool)), line), "no sample is used"),
@@ -210,11 +194,11 @@ LINE_DATA = measured(VALUES)
             lambda: Problem(STACK, measured(1e-300 * np.ones_like(VALUES)), line),
             r"^values: the median of \|value\| is 1e-300 1/sr; .* must be in \[1e-96, 1e\+30\], or Noise.floor",
         ),
-        (lambda: Problem(STACK, LINE_DATA, line, objective="l1"), "objective: 'l1' is not one of 'likelihood', "),
         (lambda: Problem(STACK, LINE_DATA, line, scale=-1.0), "scale is -1.0"),
+        (lambda: Problem(STACK, LINE_DATA, line, objective="l1"), "objective: 'l1' is not one of 'likelihood', "),
         (
             lambda: Problem(STACK, LINE_DATA, line, objective="cube_root"),
-            r"the prior of \['b'\]: objective 'cube_root' weighs neither",
+            r"the prior of \['b'\]: objective 'cube_root'",
         ),
         (lambda: Problem(WALK, TWO, objective="cosine_l2"), "the prior of base.albedo: objective 'cosine_l2' weighs"),
         (
@@ -226,7 +210,6 @@ LINE_DATA = measured(VALUES)
             r"noise\.discrepancy: objective 'cube_root' weighs neither",
         ),
         (lambda: Problem(WALK, replace(TWO, values=TWO.values[:, :1], channels=("a",))), "it has 2 channels, the data"),
-        (lambda: Problem(PAINT, DATA, transport=lj.Statistical), r'is not a Transport or "auto"'),
         (lambda: Problem(PAINT, DATA, transport="walk"), r'transport: .* is not a Transport or "auto"'),
         (
             lambda: Problem(lj.Stack([], lj.OrenNayar(0.4, Free(MANY, 0.0, 1.0))), DATA, lj.SingleScattering()),

@@ -7,10 +7,8 @@ import numpy as np
 import pytest
 
 import layerjax as lj
+from fits import Discrepancy, Instrument, Noise
 from fits.optimise.options import FitOptions, options_from
-from fits.problem.discrepancy import Discrepancy
-from fits.problem.instrument import Instrument
-from fits.problem.noise import Noise
 from fits.problem.parameters import Box, Free, LogNormal, LogUniform, Normal, PowerLaw, is_free
 from fits.problem.stack_file import material_to_dict, read_instrument, read_problem, stack_from_dict, write_problem
 from tests.helpers import places
@@ -122,7 +120,6 @@ LAW = PowerLaw(Free(4.0, 0.1, 50.0), Free(0.0, -4.0, 4.0), (450.0, 550.0), 600.0
 
 
 def test_dictionary_round_trip():
-    """Numbers in single precision stay short."""
     for stack in (
         lj.Stack([], base=lj.Conductor(ior=[0.2, 0.9, 1.1], k=3.9, alpha=0.1)),
         lj.Stack([], base=lj.VMFDiffuse(Free(0.4, 0.0, [0.8, 0.9, 1.0]), Free(0.3, 0.0, 1.0), form="all_orders")),
@@ -244,7 +241,6 @@ VALUES = {
 
 @pytest.mark.parametrize("name", VALUES)
 def test_any_value_in_any_place(tmp_path: Path, name: str) -> None:
-    """It can be computed with, or one line says where it is."""
     path = tmp_path / "stack.toml"
     for place, text in PLACES.items():
         path.write_text(text.replace("@", VALUES[name]))

@@ -7,9 +7,6 @@ import numpy as np
 import pytest
 
 import fits
-from fits.data.measurements import Measurements
-from fits.optimise.result import Fit
-from fits.sampling.posterior import Posterior
 from tests.helpers.models import LINE, line, line_data
 
 A, B = "['a']", "['b']"
@@ -24,13 +21,13 @@ def text(html: str) -> str:
     return "".join(ET.fromstring(f"<div>{html}</div>").itertext())
 
 
-def chain(fit: Fit, converged: bool) -> Posterior:
+def chain(fit: fits.Fit, converged: bool) -> fits.Posterior:
     """Independent draws about the best values: 500 steps of 8 walkers."""
     steps = fit.vector + fit.errors * np.random.default_rng(0).standard_normal((500, 8, len(fit.vector)))
-    return Posterior(fit, steps, np.zeros((500, 8)), np.ones(len(fit.vector)), acceptance=0.4, converged=converged)
+    return fits.Posterior(fit, steps, np.zeros((500, 8)), np.ones(len(fit.vector)), acceptance=0.4, converged=converged)
 
 
-def test_a_fit_is_its_verdict_and_its_values(coat_fit: Fit) -> None:
+def test_a_fit_is_its_verdict_and_its_values(coat_fit: fits.Fit) -> None:
     shown = coat_fit._repr_html_()
     head, *found = rows(shown)
     assert head == ["parameter", "value", "error", "unit", "bounds", "identifiability"]
@@ -42,7 +39,7 @@ def test_a_fit_is_its_verdict_and_its_values(coat_fit: Fit) -> None:
     assert f"reduced chi-square {coat_fit.reduced_chi_square:.3g}" in text(shown)
 
 
-def test_what_is_not_identified_is_named(result: Fit) -> None:
+def test_what_is_not_identified_is_named(result: fits.Fit) -> None:
     direction = fits.Direction(float("inf"), {A: 0.8, B: -0.6}, {A: 0.1, B: 0.2})
     case = replace(result, at_bound=(A,), errors=np.array([np.nan, 0.1]), unidentified=(direction,))
     shown = case._repr_html_()
@@ -51,7 +48,7 @@ def test_what_is_not_identified_is_named(result: Fit) -> None:
     assert any(row[2:4] == ["unidentified", f"+0.8 {A}, -0.6 {B}"] for row in rows(shown))
 
 
-def test_a_posterior_has_estimates_only_if_its_chain_is_long_enough(result: Fit) -> None:
+def test_a_posterior_has_estimates_only_if_its_chain_is_long_enough(result: fits.Fit) -> None:
     long, short = chain(result, True)._repr_html_(), chain(result, False)._repr_html_()
     head, *found = rows(long)
     assert head[:2] == ["parameter", "median"]
@@ -63,7 +60,7 @@ def test_a_posterior_has_estimates_only_if_its_chain_is_long_enough(result: Fit)
     assert "it gives no estimates yet" in text(short)
 
 
-def test_joint_fits_and_comparisons_are_shown_and_names_are_no_html(result: Fit) -> None:
+def test_joint_fits_and_comparisons_are_shown_and_names_are_no_html(result: fits.Fit) -> None:
     problems = {
         key: fits.Problem(LINE, line_data(seed=seed), line) for seed, key in enumerate(["<b>first</b>", "second"])
     }
@@ -77,7 +74,7 @@ def test_joint_fits_and_comparisons_are_shown_and_names_are_no_html(result: Fit)
     assert "prefer sloped <line>" in text(shown)
 
 
-def test_words_are_short_and_on_one_line(result: Fit, coat_data: Measurements) -> None:
+def test_words_are_short_and_on_one_line(result: fits.Fit, coat_data: fits.Measurements) -> None:
     words = f"{len(coat_data)} data points, 10 of them masked, of value, from simulated data"
     assert repr(coat_data) == f"<Measurements: {words}>"
     assert repr(fits.slices(incidence=[10, 30], outgoing=[0, 20])) == "<Geometry: 4 pairs of directions>"

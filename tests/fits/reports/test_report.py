@@ -11,14 +11,9 @@ import pytest
 from matplotlib.figure import Figure
 
 import layerjax as lj
-from fits.any_report import report
-from fits.data.geometry import slices
-from fits.data.measurements import Measurements, Source
+from fits import Fit, Free, Measurements, Noise, fit, report, slices
+from fits.data.measurements import Source
 from fits.data.scans import in_plane, signed_angle
-from fits.optimise.fit import fit
-from fits.optimise.result import Fit
-from fits.problem.noise import Noise
-from fits.problem.parameters import Free
 from fits.reports import tables
 from fits.reports.html import FitReport
 from fits.reports.plots import data as pictures
@@ -72,9 +67,6 @@ def test_the_report_begins_with_the_verdict_and_lists_the_incidences_that_were_f
     assert text.index('class="verdict') < text.index("<h2>")
 
 
-# ---- tables ----
-
-
 class Terminal(io.StringIO):
     def isatty(self) -> bool:
         return True
@@ -112,9 +104,6 @@ def test_what_is_too_wide_is_folded_and_never_cut(width: int, monkeypatch: pytes
     assert max(map(len, text.splitlines())) <= width
     assert "…" not in text
     assert Counter("".join("".join(row).replace(" ", "") for row in rows)) <= Counter(text)
-
-
-# ---- pictures ----
 
 
 def test_a_grey_stack_is_drawn_in_all_channels(coat_data: Measurements) -> None:

@@ -1,5 +1,6 @@
 """Fits of totals in result directories, reports and on the command line."""
 
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -8,7 +9,6 @@ import pytest
 
 import fits
 import layerjax as lj
-from fits.cli.parser import main
 from fits.reports.data_summary import data_table, source_rows
 from fits.reports.plots.data import totals_picture
 from tests.helpers.commands import refused
@@ -31,19 +31,16 @@ def test_a_fit_by_spheres_is_kept_and_reported(tmp_path: Path) -> None:
     assert "In the plane of incidence" not in page
 
 
-def test_on_the_command_line(work: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_on_the_command_line(work: Path, capsys: pytest.CaptureFixture[str], layerjax: Callable) -> None:
     (work / "totals.csv").write_text("theta_i,total_reflectance,total_reflectance_sigma\n0,0.30,0.003\n60,0.21,0.003\n")
-    assert main(["info", "totals.csv"]) == 0
-    assert "shares of the incident flux" in capsys.readouterr().out
+    assert "shares of the incident flux" in layerjax("info totals.csv").out
     assert (work / "totals.png").is_file()
-    assert main(["fit", "totals.csv", "--stack", "coat.toml", "--out", "result", "--starts", "1"]) == 0
-    assert "layers[0].thickness" in capsys.readouterr().out
+    assert "layers[0].thickness" in layerjax("fit totals.csv --stack coat.toml --out result --starts 1").out
     assert (work / "result" / "report.html").is_file()
-    assert main(["convert", "totals.csv", "copy.csv"]) == 0
+    layerjax("convert totals.csv copy.csv")
     np.testing.assert_array_equal(fits.read("copy.csv").values, fits.read("totals.csv").values)
     sphere = "200 25 12 1 0.96"
     (work / "slab.rxt").write_text(f"IAD1 1.4 1.5 2.0 1.0 5 0.98 1 {sphere} {sphere} 2 0.3 0.4\n")
-    capsys.readouterr()
     fit = ["fit", "totals.csv", "--stack", "coat.toml", "--out", "r"]
     for words, message in (
         ([*fit, "--select", "incidence=0"], "--select does not apply"),

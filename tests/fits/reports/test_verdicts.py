@@ -9,14 +9,8 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from fits.data.geometry import slices
+from fits import Direction, Fit, Free, Noise, Problem, fit, slices
 from fits.data.scans import correlation, neighbours, signed_angle
-from fits.optimise.fit import fit
-from fits.optimise.result import Fit
-from fits.optimise.uncertainty import Direction
-from fits.problem.noise import Noise
-from fits.problem.parameters import Free
-from fits.problem.problem import Problem
 from fits.reports import tables, verdicts
 from fits.reports.plots.model import bsdf, curves_picture, misfit
 from fits.reports.verdicts import assess, identifiability, standardised

@@ -1,17 +1,15 @@
 """The No-U-Turn sampler: the same posterior as emcee's, from a few chains that follow the gradient."""
 
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from fits.cli.parser import main
-from fits.optimise.result import Fit
-from fits.reports.results import load_posterior, save_fit
+from fits import Fit, Posterior, load_posterior, sample, save_fit
 from fits.sampling.nuts import Nuts, _step
-from fits.sampling.posterior import Posterior
-from fits.sampling.sample import load, sample, settings
+from fits.sampling.sample import load, settings
 
 pytest.importorskip("blackjax")
 
@@ -79,18 +77,13 @@ def test_chains_and_extra_are_there(result: Fit, monkeypatch: pytest.MonkeyPatch
 
 
 @pytest.mark.slow
-def test_the_command_samples_with_it(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], coat_fit: Fit, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_the_command_samples_with_it(work: Path, coat_fit: Fit, layerjax: Callable) -> None:
     save_fit(coat_fit, "result")
-    assert main(["sample", "result", "--sampler", "nuts", "--max-steps", "100", "--allow-unconverged"]) == 1
-    shown = capsys.readouterr()
+    shown = layerjax("sample result --sampler nuts --max-steps 100 --allow-unconverged", 1)
     assert "The sampler: NUTS, 0 divergences in 400 steps" in shown.out
     assert "layerjax: warm-up 300/300" in shown.err
-    assert main(["sample", "result", "--max-steps", "200", "--allow-unconverged"]) == 1  # the chain's own sampler
+    layerjax("sample result --max-steps 200 --allow-unconverged", 1)  # the chain's own sampler
     posterior = load_posterior("result")
     assert posterior is not None
     assert posterior.chain.shape[:2] == (200, 4)
-    assert main(["sample", "result", "--sampler", "emcee"]) == 2
-    assert "(sampler nuts, not emcee, walkers 4, not 32)" in capsys.readouterr().err
+    assert "(sampler nuts, not emcee, walkers 4, not 32)" in layerjax("sample result --sampler emcee", 2).err

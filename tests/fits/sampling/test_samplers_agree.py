@@ -5,12 +5,9 @@ from typing import get_args
 import numpy as np
 import pytest
 
-from fits.optimise.fit import fit
-from fits.optimise.result import Fit
-from fits.problem.parameters import Free
-from fits.sampling.posterior import Posterior
-from fits.sampling.sample import Sampler, sample
-from tests.helpers.models import COUNT, LINE, LOBE_STACK, design, line, line_data, lobe, noisy_lobe, student_fit
+from fits import Fit, Free, Posterior, fit, sample
+from fits.sampling.sample import Sampler
+from tests.helpers.models import COUNT, LOBE_STACK, design, line, line_data, lobe, noisy_lobe, student_fit
 
 pytest.importorskip("blackjax")
 
@@ -48,7 +45,6 @@ def test_quantiles_of_nuts_are_those_of_emcee(plain: Posterior) -> None:
 
 @pytest.mark.parametrize("sampler", get_args(Sampler))
 def test_one_parameter(sampler: Sampler) -> None:
-    """The slope of a line through a known point: mean and deviation in closed form."""
     fitted = fit({"a": 1.0, "b": Free(0.1, -1.0, 3.0)}, line_data(), transport=line, starts=2)
     x = design(COUNT)[:, 1]
     posterior = sample(fitted, sampler=sampler, seed=2)
@@ -57,13 +53,3 @@ def test_one_parameter(sampler: Sampler) -> None:
     error = 5 / np.sqrt(posterior.effective_samples.min())
     assert average == pytest.approx(mean, abs=error * spread)
     assert deviation == pytest.approx(spread, rel=error)
-
-
-@pytest.mark.parametrize("sampler", ["emcee", pytest.param("nuts", marks=pytest.mark.slow)])
-def test_a_direction_that_is_open_fills_its_box(sampler: Sampler) -> None:
-    fitted = fit({**LINE, "c": Free(0.5, 0.0, 1.0)}, line_data(), transport=line, starts=2)
-    posterior = sample(fitted, sampler=sampler, seed=3)
-    kept = posterior.chain[posterior.burn_in :, :, posterior.names.index("['c']")]
-    error = 5 / np.sqrt(posterior.effective_samples.min())
-    assert kept.mean() == pytest.approx(0.5, abs=error * np.sqrt(1 / 12))
-    assert kept.std() == pytest.approx(np.sqrt(1 / 12), rel=error)
