@@ -33,15 +33,7 @@ from fits.optimise.multi_start import (
     unit_of,
 )
 from fits.optimise.options import DEFAULT, FitOptions
-from fits.optimise.resolution import (
-    FAR_RINGS,
-    Accuracy,
-    has_rays,
-    leaves_rays_open,
-    refined,
-    resolutions,
-    rings_of_lobes,
-)
+from fits.optimise.resolution import Accuracy, for_starts, refined
 from fits.optimise.result import OUTCOMES, Fit, Minimum, WithoutDiscrepancy
 from fits.optimise.uncertainty import UNCONSTRAINED_BEYOND
 from fits.problem.instrument import Instrument
@@ -220,16 +212,7 @@ def _fit_from(
 ) -> Fit:
     """The fit from these points (starts, P) of the unit box, in four steps."""
     # 1. all starts, at a coarse resolution where that is open
-    known = {name: found for name, one in problem.problems.items() if (found := resolutions(one)) is not None}
-    open_rays = {name for name, one in problem.problems.items() if leaves_rays_open(one)}
-    coarse = {name: replace(problem.problems[name], transport=one.far) for name, one in known.items() if one.open}
-    problem = problem.with_problems(coarse)
-    for name in open_rays:
-        one = problem.problems[name]
-        rings = min(rings_of_lobes(one, one.start), FAR_RINGS)
-        problem = problem.with_problems(
-            {name: replace(one, instrument=replace(cast(Any, one.instrument), rings=rings))}
-        )
+    problem, choices = for_starts(problem)
     if run.screen:
         ends = screened_starts(problem, points)
     elif run.checkpoint is None:
@@ -241,8 +224,8 @@ def _fit_from(
     at = polish(problem, ends, tolerance=ROUGH_TOLERANCE if run.screen else COST_TOLERANCE)
     # 3. at the resolution that the noise of the data asks for
     accuracy = None
-    if not run.screen and (known or any(map(has_rays, problem.problems.values()))):
-        at, accuracy = refined(at, known, open_rays, run.options, run.progress)
+    if not run.screen:
+        at, accuracy = refined(at, choices, run.options, run.progress)
     # 4. what follows from it
     return _result(at, accuracy, run, without)
 

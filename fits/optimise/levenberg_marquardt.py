@@ -1,12 +1,11 @@
-"""Levenberg-Marquardt within a box, on the normal equations, as an optimistix solver; and through a model.
+"""Levenberg-Marquardt within a box, on the normal equations; and through a model.
 
-optimistix has no bounds, and a transform to an unconstrained space sends a parameter whose best value lies on its bound
-to infinity, where gradients vanish. Here the iterate stays in the box: parameters that push against a bound are held
-there, the others take a damped Gauss-Newton step, and what would leave the box is put on its face (projected
-Levenberg-Marquardt, Kanzow, Yamashita and Fukushima 2004). The few columns of the Jacobian are carried forward together
-and only J'J and J'r are kept, which is several times faster than a QR decomposition of J when there are many more
-residuals than parameters. Columns are scaled to unit length first, so that units do not matter to the damping (after
-Marquardt 1963; its update after Nielsen 1999).
+A transform to an unconstrained space sends a parameter whose best value lies on its bound to infinity, where gradients
+vanish. Here the iterate stays in the box: parameters that push against a bound are held there, the others take a damped
+Gauss-Newton step, and what would leave the box is put on its face (projected Levenberg-Marquardt, Kanzow, Yamashita and
+Fukushima 2004). The few columns of the Jacobian are carried forward together and only J'J and J'r are kept, which is
+several times faster than a QR decomposition of J when there are many more residuals than parameters. Columns are scaled
+to unit length first, so that units do not matter to the damping (after Marquardt 1963; its update after Nielsen 1999).
 
 To compile the Jacobian of a costly transport takes longer than most fits take to run. So whatever needs it, at one
 point or along many steps, calls `descend`: a descent of a single step says what is known where it begins.
@@ -19,7 +18,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
 from jax import Array
 from numpy.typing import NDArray
 
@@ -31,6 +29,9 @@ Floats = NDArray[np.float64]
 COST_TOLERANCE = 1e-8
 """A likelihood fit has converged when a full step is predicted to gain less than this in the log-posterior: 1e-4
 standard errors."""
+
+RELATIVE_TOLERANCE = 1e-10
+"""Without a likelihood: less than this share of the cost."""
 
 NEARBY = 1e-4
 """Damping near a minimum: a step is all but a full one."""
@@ -47,8 +48,18 @@ SHORTEST = 1e-7  # column of the Jacobian, of the longest one: shorter ones are 
 PASSES = 3
 
 
-class _State(eqx.Module):
+class State(eqx.Module):
+    """Where a descent in the unit box [0, 1]^P has come to after `steps` trials.
+
+    point: (P,), the best so far, with what is known there: cost, gradient (P,) and normal matrix (P, P), the auxiliary
+    output of the residuals, and the Jacobian of what is watched of it, a leading axis for the parameters.
+    trial: (P,), what is tried next, to gain `predicted` in the cost; full_decrease: more cannot be gained.
+    ended: nothing is left to gain, or no step gains anything; failed: no step does though something is left, or the
+    start has residuals that are not finite.
+    """
+
     steps: Array
+    point: Array
     trial: Array
     cost: Array
     gradient: Array
@@ -59,127 +70,99 @@ class _State(eqx.Module):
     growth: Array
     auxiliary: Any
     watched: Any
-    terminate: Array
+    ended: Array
     failed: Array
 
 
-class BoxLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
-    """Minimises half the sum of squared residuals over vectors in [0, 1]^P.
+def first_state(point: Array, damping: Array, auxiliary: Any, watched: Any = None) -> State:
+    """Before the first trial, which is the point itself; auxiliary, watched: of the shapes that they will have."""
+    zero, no = jnp.zeros((), point.dtype), jnp.array(False)
+    return State(
+        steps=jnp.zeros((), int),
+        point=point,
+        trial=point,
+        cost=zero + jnp.inf,
+        gradient=jnp.zeros_like(point),
+        normal=jnp.eye(point.size, dtype=point.dtype),
+        predicted=zero,
+        full_decrease=zero + jnp.inf,
+        damping=zero + damping,
+        growth=zero + FIRST_GROWTH,
+        auxiliary=auxiliary,
+        watched=watched,
+        ended=no,
+        failed=no,
+    )
 
-    The residuals are a tree of arrays. Those whose place among its leaves is in `options["logarithmic"]` have
-    logarithms L of noise levels as half their squares: dL'dL takes the place of their J'J, which makes the sum the
-    Fisher information (J'J alone would overshoot up to twofold at every step).
 
-    It stops when a full Gauss-Newton step is predicted to gain less than `options["tolerance"]` (default: `atol + rtol
-    cost`), when rounding ends all progress, or after `options["most_steps"]`; it begins with `options["damping"]`. All
-    of these may be traced. A start whose residuals are not finite, or a stall away from a minimum, gives
-    `optx.RESULTS.nonlinear_divergence`.
+def step(
+    residuals: Callable[[Array], tuple[Any, Any]],
+    state: State,
+    tolerance: Array | float | None = None,
+    logarithmic: tuple[int, ...] = (),
+    watch: Callable[[Any], Any] = lambda auxiliary: None,
+) -> State:
+    """Evaluate the trial, accept or refuse it, and propose the next one.
 
-    The solution has the auxiliary output at the solution, and statistics have the "cost" and its "gradient" there; as
-    "watched" the Jacobian, a leading axis for the P parameters, of the part of it that `options["watch"]` picks.
+    residuals: of a point, a tree of arrays, half whose sum of squares is the cost; and an auxiliary output.
+    tolerance: it ends when a full Gauss-Newton step is predicted to gain less; None: `RELATIVE_TOLERANCE` of the cost.
+    logarithmic: places among the leaves of the residuals of those that have logarithms L of noise levels as half their
+        squares: dL'dL takes the place of their J'J, which makes the sum the Fisher information (J'J alone would
+        overshoot up to twofold at every step).
+    watch: picks the part of the auxiliary output whose Jacobian is kept.
     """
+    first = state.steps == 0
+    at_trial = _normal_equations(residuals, state.trial, logarithmic, watch)
+    cost, gradient, normal = at_trial[:3]
+    finite = jnp.isfinite(cost) & jnp.all(jnp.isfinite(gradient)) & jnp.all(jnp.isfinite(normal))
+    ratio = (state.cost - cost) / jnp.where(state.predicted > 0, state.predicted, 1.0)
+    accept = finite & (first | (ratio > SMALLEST_RATIO))
 
-    rtol: float = 1e-10
-    atol: float = 0.0
-    norm: Callable[[Any], Array] = optx.max_norm
+    shrink = jnp.maximum(1.0 / 9.0, 1.0 - (2.0 * jnp.clip(ratio, 0.0, 1.0) - 1.0) ** 3)
+    next_damping = jnp.where(accept, state.damping * shrink, state.damping * state.growth)
+    epsilon = jnp.finfo(cost.dtype).eps
+    least = jnp.asarray(SMALLEST_DAMPING * epsilon, cost.dtype)
+    damping = jnp.maximum(jnp.where(first, state.damping, next_damping), least)
 
-    def init(self, fn: Any, y: Array, args: Any, options: Any, f_struct: Any, aux_struct: Any, tags: Any) -> _State:
-        """State before the first evaluation."""
-        zero = jnp.zeros((), y.dtype)
-        auxiliary = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), aux_struct)
-        watched = jax.tree.map(lambda leaf: jnp.zeros((y.size, *leaf.shape), leaf.dtype), _watch(options)(aux_struct))
-        return _State(
-            steps=jnp.zeros((), int),
-            trial=y,
-            cost=zero + jnp.inf,
-            gradient=jnp.zeros_like(y),
-            normal=jnp.eye(y.size, dtype=y.dtype),
-            predicted=zero,
-            full_decrease=zero + jnp.inf,
-            damping=zero + options.get("damping", FIRST_DAMPING),
-            growth=zero + FIRST_GROWTH,
-            auxiliary=auxiliary,
-            watched=watched,
-            terminate=jnp.array(False),
-            failed=jnp.array(False),
-        )
+    before = state.point, state.cost, state.gradient, state.normal, state.auxiliary, state.watched
+    point, cost, gradient, normal, auxiliary, watched = jax.tree.map(
+        lambda new, old: jnp.where(accept, new, old), (state.trial, *at_trial), before
+    )
+    trial, predicted, full_decrease = _projected_step(point, gradient, normal, damping, least)
 
-    def step(self, fn: Any, y: Array, args: Any, options: Any, state: _State, tags: Any) -> tuple[Array, _State, Any]:
-        """Evaluate the trial, accept or refuse it, and propose the next one."""
-        first = state.steps == 0
-        cost, gradient, normal, auxiliary, watched = _normal_equations(fn, state.trial, args, options)
-        finite = jnp.isfinite(cost) & jnp.all(jnp.isfinite(gradient)) & jnp.all(jnp.isfinite(normal))
-        ratio = (state.cost - cost) / jnp.where(state.predicted > 0, state.predicted, 1.0)
-        accept = finite & (first | (ratio > SMALLEST_RATIO))
-
-        shrink = jnp.maximum(1.0 / 9.0, 1.0 - (2.0 * jnp.clip(ratio, 0.0, 1.0) - 1.0) ** 3)
-        step_damping = jnp.where(accept, state.damping * shrink, state.damping * state.growth)
-        epsilon = jnp.finfo(y.dtype).eps
-        least = jnp.asarray(SMALLEST_DAMPING * epsilon, y.dtype)
-        damping = jnp.maximum(jnp.where(first, state.damping, step_damping), least)
-        growth = jnp.where(accept, FIRST_GROWTH, 2.0 * state.growth)
-
-        y = jnp.where(accept, state.trial, y)
-        cost, gradient, normal = (
-            jnp.where(accept, new, old)
-            for new, old in ((cost, state.cost), (gradient, state.gradient), (normal, state.normal))
-        )
-        auxiliary, watched = jax.tree.map(
-            lambda new, old: jnp.where(accept, new, old), (auxiliary, watched), (state.auxiliary, state.watched)
-        )
-        trial, predicted, full_decrease = _projected_step(y, gradient, normal, damping, least)
-
-        enough = options.get("tolerance", self.atol + self.rtol * cost)
-        converged = full_decrease <= jnp.maximum(enough, 4 * epsilon * cost)
-        lost = ~accept & (predicted > 0) & (predicted <= 4 * epsilon * cost)  # too small a decrease to be seen
-        stalled = lost & (full_decrease > jnp.sqrt(epsilon) * cost)
-        hopeless = stalled | (damping > LARGEST_DAMPING) | (first & ~finite)
-        new_state = _State(
-            steps=state.steps + 1,
-            trial=trial,
-            cost=cost,
-            gradient=gradient,
-            normal=normal,
-            predicted=predicted,
-            full_decrease=full_decrease,
-            damping=damping,
-            growth=growth,
-            auxiliary=auxiliary,
-            watched=watched,
-            terminate=converged | lost | hopeless,
-            failed=hopeless & ~converged,
-        )
-        return y, new_state, auxiliary
-
-    def terminate(
-        self, fn: Any, y: Array, args: Any, options: Any, state: _State, tags: Any
-    ) -> tuple[Array, optx.RESULTS]:
-        """Whether to stop, and why."""
-        out_of_steps = state.steps >= options.get("most_steps", jnp.inf)
-        short = optx.RESULTS.where(state.terminate, optx.RESULTS.successful, optx.RESULTS.nonlinear_max_steps_reached)
-        result = optx.RESULTS.where(state.failed, optx.RESULTS.nonlinear_divergence, short)
-        running = ~(state.terminate | out_of_steps)
-        return ~running, optx.RESULTS.where(running, optx.RESULTS.successful, result)
-
-    def postprocess(
-        self, fn: Any, y: Array, aux: Any, args: Any, options: Any, state: _State, tags: Any, result: Any
-    ) -> tuple[Array, Any, dict[str, Any]]:
-        """The solution, and what is known there."""
-        return y, state.auxiliary, {"cost": state.cost, "gradient": state.gradient, "watched": state.watched}
+    enough = RELATIVE_TOLERANCE * cost if tolerance is None else tolerance
+    converged = full_decrease <= jnp.maximum(enough, 4 * epsilon * cost)
+    lost = ~accept & (predicted > 0) & (predicted <= 4 * epsilon * cost)  # too small a decrease to be seen
+    stalled = lost & (full_decrease > jnp.sqrt(epsilon) * cost)
+    hopeless = stalled | (damping > LARGEST_DAMPING) | (first & ~finite)
+    return State(
+        steps=state.steps + 1,
+        point=point,
+        trial=trial,
+        cost=cost,
+        gradient=gradient,
+        normal=normal,
+        predicted=predicted,
+        full_decrease=full_decrease,
+        damping=damping,
+        growth=jnp.where(accept, FIRST_GROWTH, 2.0 * state.growth),
+        auxiliary=auxiliary,
+        watched=watched,
+        ended=converged | lost | hopeless,
+        failed=hopeless & ~converged,
+    )
 
 
-def _watch(options: Any) -> Callable[[Any], Any]:
-    """What picks the part of the auxiliary output whose Jacobian is kept: nothing by default."""
-    return options.get("watch", lambda auxiliary: None)
-
-
-def _normal_equations(fn: Any, y: Array, args: Any, options: Any) -> tuple[Array, Array, Array, Any, Any]:
-    """Cost, J'r and J'J at y, with J'J replaced for the `logarithmic` arrays of residuals; the auxiliary output, and
-    the Jacobian of what is watched of it."""
-    logarithmic, watch = options.get("logarithmic", ()), _watch(options)
+def _normal_equations(
+    residuals_of: Callable[[Array], tuple[Any, Any]],
+    y: Array,
+    logarithmic: tuple[int, ...],
+    watch: Callable[[Any], Any],
+) -> tuple[Array, Array, Array, Any, Any]:
+    """Cost, J'r and J'J at y, the auxiliary output, and the Jacobian of what is watched of it; see `step`."""
 
     def push(tangent: Array) -> tuple[Any, Any, Any, Any]:
-        (residuals, auxiliary), (tangents, moved) = jax.jvp(lambda z: fn(z, args), (y,), (tangent,))
+        (residuals, auxiliary), (tangents, moved) = jax.jvp(residuals_of, (y,), (tangent,))
         return residuals, auxiliary, tangents, watch(moved)
 
     residuals, auxiliary, columns, watched = jax.vmap(push, out_axes=(None, None, 0, 0))(jnp.eye(y.size, dtype=y.dtype))
@@ -197,11 +180,10 @@ def _normal_equations(fn: Any, y: Array, args: Any, options: Any) -> tuple[Array
 def _projected_step(
     y: Array, gradient: Array, normal: Array, damping: Array, least: Array
 ) -> tuple[Array, Array, Array]:
-    """The next trial in the box, the decrease that the quadratic model predicted decrease there, and the most it could
-    predicted decrease.
+    """The next trial in the box, the decrease that the quadratic model predicts there, and the most that can be gained.
 
-    The last belongs to the undamped step of all parameters that are not held, as if there were no box, but no more than
-    the slope gives on the way to the faces of the box: it bounds what is left to gain.
+    The last belongs to the undamped step of all parameters that are not held, as if there were no box, but is no more
+    than the slope gives on the way to the faces of the box.
     """
     length = jnp.sqrt(jnp.diagonal(normal))
     # a parameter of hardly any influence would take a step as wide as the box for next to no gain, however damped
@@ -262,41 +244,43 @@ def descend(model: Model, start: Array, fresh: Array, most_steps: Array, toleran
     `tolerance` in the log-posterior. Not `fresh`: near a minimum, all levels free."""
     likelihood = model.objective == "likelihood"
     varying = likelihood and bool(model.logarithmic)
-    solver, damping = BoxLevenbergMarquardt(), jnp.where(fresh, FIRST_DAMPING, NEARBY)
-    options = {
-        "watch": lambda auxiliary: auxiliary[1],
-        "damping": damping,
-        **({"tolerance": tolerance} if likelihood else {}),
-    }
-    options |= {"logarithmic": model.logarithmic} if varying else {}
-
-    def residuals(unit: Array, first_step: tuple[Array, Array]) -> Any:
-        return model.linear_parts(model.box.from_unit(unit), first_step if varying else None)
+    damping = jnp.where(fresh, FIRST_DAMPING, NEARBY)
 
     def stage(unit: Array, held: tuple[Array, Array, Array]) -> tuple[Array, Descent]:
-        *first_step, most = held
-        solution: Any = optx.least_squares(
-            residuals,
-            solver,
-            unit,
-            args=tuple(first_step),
-            has_aux=True,
-            options={**options, "most_steps": most},
-            max_steps=None,
-            throw=False,
+        sigma, share, most = held
+
+        def residuals(unit: Array) -> Any:
+            return model.linear_parts(model.box.from_unit(unit), (sigma, share) if varying else None)
+
+        def onward(state: State) -> State:
+            return step(
+                residuals,
+                state,
+                tolerance if likelihood else None,
+                model.logarithmic if varying else (),
+                watch=lambda auxiliary: auxiliary[1],
+            )
+
+        shapes = jax.eval_shape(residuals, unit)[1]
+        auxiliary = jax.tree.map(lambda one: jnp.zeros(one.shape, one.dtype), shapes)
+        watched = jnp.zeros((unit.size, *auxiliary[1].shape), auxiliary[1].dtype)
+        end = jax.lax.while_loop(
+            lambda state: ~state.ended & (state.steps < most),
+            onward,
+            first_state(unit, damping, auxiliary, watched),
         )
         found = Descent(
-            vector=model.box.from_unit(solution.value),
-            cost=solution.stats["cost"],
-            steps=solution.stats["num_steps"],
-            converged=jnp.asarray(solution.result == optx.RESULTS.successful),
-            max_steps_reached=jnp.asarray(solution.result == optx.RESULTS.nonlinear_max_steps_reached),
-            gradient=solution.stats["gradient"],
+            vector=model.box.from_unit(end.point),
+            cost=end.cost,
+            steps=end.steps,
+            converged=end.ended & ~end.failed,
+            max_steps_reached=~end.ended,
+            gradient=end.gradient,
             # R of the QR decomposition has A's singular values without squaring its condition number
-            root=jnp.linalg.qr(solution.stats["watched"].T, mode="r"),
-            predicted=solution.aux[0],
+            root=jnp.linalg.qr(end.watched.T, mode="r"),
+            predicted=end.auxiliary[0],
         )
-        return solution.value, found
+        return end.point, found
 
     sigmas, most, shared = jnp.full((1, 1, 1), jnp.nan), most_steps[None], jnp.ones(1)
     if varying:  # far from the data, a level grows until everything fits: go near it first, with sigma held
