@@ -47,11 +47,8 @@ from layerjax.compiling import programs_kept
 
 Floats = NDArray[np.float64]
 
-SAME_AT_MOST = 0.05
-"""Share of its box up to which a standard error counts where minima are compared."""
-
-MOST_STARTS = 8
-"""Minima without model discrepancy that the fit with it starts from; of its other starts half as many."""
+SAME_AT_MOST = 0.05  # share of its box up to which a standard error counts where minima are compared
+MOST_STARTS = 8  # minima without model discrepancy that the fit with it starts from; of other starts half as many
 
 
 @programs_kept()
@@ -86,8 +83,8 @@ def fit(
         options: tolerances and thresholds.
         progress: called with ("fit", starts done, starts, note).
         checkpoint: a file that each start is kept in as it ends: a fit that was killed takes those that are there for
-            done. It stays, as does one beside it for what is fitted again with model discrepancy; one of another
-            problem is replaced.
+            done. It stays, as does one beside it for a second fit with model discrepancy; one of another problem is
+            replaced.
         screen: stay at the resolution of the starts, do not estimate its error, continue only the starts that are
             lowest after a few steps, and stop near the minimum: enough to rank stacks.
 
@@ -95,23 +92,16 @@ def fit(
         ValueError: as `Problem`; starts < 1.
     """
     if isinstance(stack, FittingProblem):
+        problem = stack
         arguments: dict[str, Any] = {"data": data, "noise": noise, "scale": scale, "instrument": instrument}
         arguments |= {"transport": None if transport == "auto" else transport}
         arguments |= {"objective": None if objective == "likelihood" else objective}
         for name, given in arguments.items():
             if given is not None:
                 raise ValueError(f"{name} is given beside a {type(stack).__name__}, which says it all")
-        problem = stack
     else:
-        problem = Problem(
-            stack,
-            cast(Measurements, data),
-            transport,
-            Noise() if noise is None else noise,
-            scale,
-            objective,
-            instrument,
-        )
+        noise = Noise() if noise is None else noise
+        problem = Problem(stack, cast(Measurements, data), transport, noise, scale, objective, instrument)
     require_count("starts", starts, 1)
     require_seed(seed)
     require_switch("screen", screen)
@@ -151,11 +141,9 @@ class _Run(NamedTuple):
 
 
 def undecided(problem: Problem) -> bool:
-    """Whether it is left to the residuals, and could be counted."""
-    noise = problem.noise
-    if isinstance(problem.data, Totals):
-        return False  # they have no neighbours
-    return noise.discrepancy is None and noise.tails == "gaussian" and problem.objective == "likelihood"
+    """Whether it is left to the residuals, and could be counted: totals have no neighbours."""
+    possible = problem.noise.tails == "gaussian" and problem.objective == "likelihood"
+    return possible and problem.noise.discrepancy is None and not isinstance(problem.data, Totals)
 
 
 def without_discrepancy(fit: Fit) -> WithoutDiscrepancy:
@@ -173,7 +161,7 @@ def without_discrepancy(fit: Fit) -> WithoutDiscrepancy:
 
 
 def needs_discrepancy(independent: WithoutDiscrepancy, options: FitOptions = DEFAULT) -> bool:
-    """Whether residuals of neighbours are correlated, by the rule above."""
+    """Whether residuals of neighbours are correlated."""
     correlation = independent.residual_autocorrelation
     clear = correlation * math.sqrt(independent.pairs) > options.autocorrelation_errors
     return clear and correlation > options.autocorrelation
@@ -182,13 +170,10 @@ def needs_discrepancy(independent: WithoutDiscrepancy, options: FitOptions = DEF
 def _with_discrepancy(
     problem: FittingProblem, independent: Fit, before: Mapping[str, WithoutDiscrepancy], run: _Run
 ) -> Fit:
-    """The fit with model discrepancy of these data sets, which were fitted with independent noise before.
-
-    It starts from the minima of that fit, and from some of as many points as that had.
-    """
-    changed = {name: problem.problems[name] for name in before}
+    """The fit with model discrepancy of these data sets: from the minima of that without, and a few other points."""
+    sets = {name: problem.problems[name] for name in before}
     whole = problem.with_problems(
-        {name: replace(one, noise=replace(one.noise, discrepancy=True)) for name, one in changed.items()}
+        {name: replace(one, noise=replace(one.noise, discrepancy=True)) for name, one in sets.items()}
     )
     points = []
     for minimum in independent.minima[:MOST_STARTS]:
@@ -215,10 +200,8 @@ def _fit_from(
     problem, choices = for_starts(problem)
     if run.screen:
         ends = screened_starts(problem, points)
-    elif run.checkpoint is None:
-        ends = multi_start(problem, points, run.progress)
-    else:  # each is kept as it ends
-        with starts_store(run.checkpoint, problem, points) as store:
+    else:
+        with starts_store(run.checkpoint, problem, points) as store:  # each is kept as it ends
             ends = multi_start(problem, points, run.progress, store)
     # 2. the lowest of them, to its very minimum, with the uncertainties there
     at = polish(problem, ends, tolerance=ROUGH_TOLERANCE if run.screen else COST_TOLERANCE)
@@ -301,8 +284,7 @@ def _minima(problem: FittingProblem, at: Optimum, options: FitOptions) -> tuple[
         equal_cost = abs(cost[index] - cost[other]) <= options.same_cost * at.excess
         return bool(np.all(np.abs(units[index] - units[other]) <= (same_at_equal_cost if equal_cost else same)))
 
-    leaders: list[int] = []
-    counts: list[int] = []
+    leaders, counts = list[int](), list[int]()
     outcomes = dict.fromkeys(OUTCOMES, 0)
     for index in sorted(range(len(ends)), key=lambda k: (cost[k], k != best)):
         if not np.isfinite(cost[index]) and index != best:

@@ -26,19 +26,11 @@ from fits.problem.problem import FittingProblem
 
 Floats = NDArray[np.float64]
 
-COST_TOLERANCE = 1e-8
-"""A likelihood fit has converged when a full step is predicted to gain less than this in the log-posterior: 1e-4
-standard errors."""
+COST_TOLERANCE = 1e-8  # converged: a full step would gain less in the log-posterior, 1e-4 standard errors
+RELATIVE_TOLERANCE = 1e-10  # or without a likelihood less than this share of the cost
+ROUGH_TOLERANCE = 1e-4  # a hundredth of a standard error: distinguishes minima, after about a third of the steps
 
-RELATIVE_TOLERANCE = 1e-10
-"""Without a likelihood: less than this share of the cost."""
-
-NEARBY = 1e-4
-"""Damping near a minimum: a step is all but a full one."""
-
-ROUGH_TOLERANCE = 1e-4
-"""A hundredth of a standard error: distinguishes minima, after about a third of the steps where these gain least."""
-
+NEARBY = 1e-4  # damping near a minimum: a step is all but a full one
 FIRST_DAMPING = 1e-2
 FIRST_GROWTH = 4.0
 SMALLEST_DAMPING = 128.0  # units of rounding: keeps a singular matrix positive definite

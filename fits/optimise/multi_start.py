@@ -7,7 +7,7 @@ continued while it gains something: the number of steps says nothing about how g
 
 import warnings
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import NamedTuple
 
@@ -29,20 +29,16 @@ from layerjax._numerics import broadcasting
 
 Floats = NDArray[np.float64]
 
-MOST_STEPS, MOST_ROUNDS = 200, 20
-"""Steps of a start in a round; and rounds, while each gains `LEAST_GAIN`."""
-LEAST_GAIN, LEAST_RELATIVE_GAIN = 1e-3, 1e-6
-"""In the log-posterior; and for a named objective, as a share of the cost."""
-EARLY, FRONT = 20, 3
-"""Steps, with sigma held and with it free, after which starts are screened, and how many of them are continued."""
-LBFGSB_STEPS, LBFGSB_TOLERANCE, LEAST_STEP_GAIN = 500, 1e-12, 1e-5
-"""The check by L-BFGS-B ends after so many steps; where the gradient of a named objective is below the second; where a
-step gains less than the last in the log-posterior."""
+MOST_STEPS, MOST_ROUNDS = 200, 20  # steps of a start in a round; and rounds, while each gains the next
+LEAST_GAIN, LEAST_RELATIVE_GAIN = 1e-3, 1e-6  # in the log-posterior; for a named objective, as a share of the cost
+EARLY, FRONT = 20, 3  # steps with sigma held, and free, after which starts are screened; how many are continued
+LBFGSB_STEPS = 500  # after which the check by L-BFGS-B ends, or where
+LEAST_STEP_GAIN = 1e-5  # a step gains less than this in the log-posterior, or
+LBFGSB_TOLERANCE = 1e-12  # the gradient of a named objective is below this
 
 
 class StartOutcome(NamedTuple):
-    """Where one start ended: physical vector (P,), cost, steps, whether it converged, whether it reached the maximum of
-    steps."""
+    """Where one start ended: physical vector (P,), cost, steps, whether it converged, or reached the most steps."""
 
     vector: Floats
     cost: float
@@ -92,8 +88,12 @@ def multi_start(
     return [ends[index] for index in range(len(points))]
 
 
-def starts_store(checkpoint: str | Path, problem: FittingProblem, points: Floats) -> AbstractContextManager[Store]:
-    """The store of the starts of a fit; starts of another fit that are there are thrown away."""
+def starts_store(
+    checkpoint: str | Path | None, problem: FittingProblem, points: Floats
+) -> AbstractContextManager[Store | None]:
+    """The store of the starts of a fit, if there is a path; starts of another fit that are there are thrown away."""
+    if checkpoint is None:
+        return nullcontext()
     arrays, static = problem.split_model
     whose = fingerprint(
         version=layerjax.__version__,
@@ -154,8 +154,7 @@ def unit_of(problem: FittingProblem, vector: Floats) -> Floats:
 def lbfgsb_polish(problem: FittingProblem, end: StartOutcome) -> tuple[StartOutcome, bool]:
     """The end, or what L-BFGS-B and then Levenberg-Marquardt make of it if that is lower; and whether it is.
 
-    A check on what lies on a bound or has not converged: the two share nothing but the objective. An end that neither
-    of them improves has converged if one of them says so.
+    An end that neither of them improves has converged if one of them says so.
     """
 
     def value_and_gradient(unit: Floats) -> tuple[Floats, Floats]:  # the gradient in reverse would be compiled for this
@@ -190,8 +189,7 @@ def lbfgsb_polish(problem: FittingProblem, end: StartOutcome) -> tuple[StartOutc
 class Optimum(NamedTuple):
     """The outcomes of all starts, the place of the lowest among them, and what is known there.
 
-    improved: whether L-BFGS-B found what Levenberg-Marquardt had not. predicted: (N, C), in 1/sr. excess: what
-    differences in cost count in, see `FitOptions`.
+    improved: by L-BFGS-B. predicted: (N, C), in 1/sr. excess: what differences in cost count in, see `FitOptions`.
     """
 
     problem: FittingProblem
@@ -209,11 +207,7 @@ class Optimum(NamedTuple):
 
 
 def polish(
-    problem: FittingProblem,
-    ends: list[StartOutcome],
-    *,
-    check: bool = True,
-    tolerance: float = COST_TOLERANCE,
+    problem: FittingProblem, ends: list[StartOutcome], *, check: bool = True, tolerance: float = COST_TOLERANCE
 ) -> Optimum:
     """The lowest of the ends, followed to its very minimum, and checked by L-BFGS-B where it has not converged.
 
@@ -247,10 +241,9 @@ def polish(
     lowest = lowest._replace(vector=np.where(held, nearest, np.clip(vector, low, high)))
     predicted = evaluate_at(problem, unit_of(problem, lowest.vector)).predicted if held.any() else found.predicted
     # 5. the reduced chi-square where it is above 1; of a named objective, the residual variance
-    freedom = max(problem.count - len(lowest.vector), 1)
-    if likelihood:
+    freedom, excess = problem.count - len(lowest.vector), 1.0
+    if not likelihood:
+        excess = 2.0 * lowest.cost / max(freedom, 1)
+    elif freedom > 0:
         excess = max(1.0, float(problem.call(Model.chi_square_at, lowest.vector, predicted)) / freedom)
-        excess = excess if problem.count > len(lowest.vector) else 1.0
-    else:
-        excess = 2.0 * lowest.cost / freedom
     return Optimum(problem, [*ends[:best], lowest, *ends[best + 1 :]], best, found, improved, predicted, excess)

@@ -29,22 +29,13 @@ from layerjax.mixture import stacks_of
 from layerjax.preparation import transport_for
 from layerjax.transport.adding_doubling.resolution import is_tilted
 
+# the finest resolution of starts, and their most rings of a cone: finer ones cost more than they tell far from the data
 FAR, FAR_RINGS = {"nodes": 12, "modes": 16, "ordinates": (8, 12)}, 2
-"""The finest resolution of starts, and their most rings of a cone: what is finer costs more than it tells far away from
-the data."""
-
-FINEST_NODES, FINEST_MODES, FINEST_COSINES = 48, 96, 16
-"""What is chosen at most."""
-
-MINOR_SHARE = 0.5
-"""Of the numerical error that is allowed: left to nodes or modes where the other is what has to be finer."""
-
-LEAST_SCATTER = 0.01
-"""Of the data's root mean square: less scatter about a named objective counts as this, so that an error of a thousandth
-is enough, which `AddingDoubling` aims at."""
-
-SAME_OUTCOME, MOST_MINIMA = 0.01, 8
-"""Of the box: ends that are closer in every parameter are fitted again as one; and the most that are."""
+FINEST_NODES, FINEST_MODES, FINEST_COSINES = 48, 96, 16  # what is chosen at most
+MINOR_SHARE = 0.5  # of the numerical error that is allowed: left to nodes or modes where the other has to be finer
+LEAST_SCATTER = 0.01  # of the data's root mean square: less scatter about a named objective counts as this
+SAME_OUTCOME = 0.01  # of the box: ends that are closer in every parameter are fitted again as one
+MOST_MINIMA = 8  # that are fitted again
 
 Floats = NDArray[np.float64]
 

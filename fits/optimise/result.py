@@ -15,13 +15,13 @@ from fits.problem.problem import Problem
 
 Floats = NDArray[np.float64]
 
+# what is said of the starts that ended in each way (see `Fit.start_outcomes`)
 OUTCOMES = {
     "best minimum": "converged to the best minimum",
     "local minima": "converged to other local minima",
     "maximum steps reached": "reached the maximum of steps",
     "failed": "failed",
 }
-"""What is said of the starts that ended in each way (see `Fit.start_outcomes`)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +38,7 @@ class Minimum:
 class WithoutDiscrepancy:
     """The same stack fitted with independent noise: values and standard errors by name, how well.
 
-    residual_autocorrelation: of neighbours along the scans. pairs: of them.
+    residual_autocorrelation: of so many `pairs` of neighbours along the scans.
     """
 
     values: dict[str, float]
@@ -75,12 +75,10 @@ class Fit:
         settings: starts, seed, and the numbers of `FitOptions`.
         start_outcomes: how many starts ended where: "best minimum", "local minima", "maximum steps reached", "failed".
         numerical_error: of the model at the best values, in standard deviations of the data (for a named objective, of
-            the residuals): the largest, as the difference from a finer resolution tells, or where that is out of reach
-            from a coarser one, which is more than it; that of the rays for an instrument's cones is added. None where
-            there is neither a resolution nor a cone.
+            the residuals): the largest difference from a finer resolution, or where that is out of reach from a coarser
+            one, which is more; that of the rays for an instrument's cones is added. None where there is neither.
         resolution: of the transport, and the rays for cones, in words; None where there is neither. `problem` holds it.
-        without_discrepancy: the fit without model discrepancy, where its residuals showed that one is needed (see
-            `Noise`); else None.
+        without_discrepancy: the fit without model discrepancy, if residuals showed that one is needed (see `Noise`).
         without_discrepancy_parts: of a `Joint`, the same by the names of measurements.
         dataset: of one measurement of a `Joint`, its name there.
     """
@@ -120,9 +118,7 @@ class Fit:
         """What the fit of a `Joint` says of one measurement, with errors that all of them leave it; itself, if alone.
 
         It predicts by the normal approximation of what all measurements say; `Posterior.part` by their draws.
-
-        Raises:
-            ValueError: a name that no measurement has.
+        ValueError for a name that no measurement has.
         """
         own = list(self.problem.places(name))
         problem = self.problem.problems[name]

@@ -17,8 +17,7 @@ from fits.sampling.posterior import Posterior, require_fits
 from layerjax._checks import require_kind
 from layerjax.compiling import programs_kept
 
-LINEAR = 1e6
-"""Softness that makes the logarithm linear, in units of the largest value: asinh(x / s) is x / s there."""
+LINEAR = 1e6  # softness that makes the logarithm linear, in units of the largest value: asinh(x / s) is x / s there
 
 
 @dataclass(frozen=True, eq=False)

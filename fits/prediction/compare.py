@@ -10,7 +10,7 @@ from fits._files import require_switch
 from fits._lazy import shown_by
 from fits.optimise.result import Fit
 from fits.prediction.cross_validation import ModelScore, model_scores
-from fits.prediction.options import ComparisonOptions
+from fits.prediction.options import DEFAULT, ComparisonOptions
 from fits.progress import Progress
 from fits.sampling.posterior import Posterior, require_fits
 from layerjax._checks import require_kind
@@ -89,20 +89,18 @@ def compare(
     require_switch("refit", refit)
     if len(candidates) < 2:
         raise ValueError(f"compare: {len(candidates)} candidate(s) given; at least 2 are needed")
-    fits, options = fits_of(candidates), options or ComparisonOptions()
+    fits, options = fits_of(candidates), options or DEFAULT
     _require_comparable(fits)
     rows = [ComparedFit(name, fit) for name, fit in fits.items()]
     if refit:
         scores = model_scores(fits, progress, options)
-        rows = [replace(row, model_score=scores[row.name]) for row in rows]
-        rows.sort(key=lambda row: -scores[row.name].elpd)
-        sorted_by = "elpd"
+        rows = [ComparedFit(name, fit, scores[name]) for name, fit in fits.items()]
+        sorted_by, ranks = "elpd", {name: -score.elpd for name, score in scores.items()}
     elif rows[0].fit.is_posterior:
-        rows.sort(key=lambda row: row.aic)
-        sorted_by = "aic"
+        sorted_by, ranks = "aic", {row.name: row.aic for row in rows}
     else:
-        rows.sort(key=lambda row: row.fit.chi_square)
-        sorted_by = "chi_square"
+        sorted_by, ranks = "chi_square", {row.name: row.fit.chi_square for row in rows}
+    rows.sort(key=lambda row: ranks[row.name])
     verdict = tuple(_verdict(rows[0], row, sorted_by, options) for row in rows[1:])
     return Comparison(tuple(rows), sorted_by, verdict, tuple(_notes(rows, options)), options)
 

@@ -29,35 +29,20 @@ from numpy.typing import ArrayLike, NDArray
 from fits.data.geometry import Floats
 from fits.problem.parameters import Free, LogNormal, Normal, require_number_or_free
 
-LONGEST = 40.0
-"""Degrees of a length scale whose prior is not given, at most: what is correlated farther would take the place of the
-stack's level."""
-
-LINEAR_BELOW, LEAST_SOFTNESS = 4.0, 1e-6
-"""Standard deviations of the additive noise below which the logarithm is linear; and what that is at least, of the
-median measurement, where nothing is said of additive noise."""
-
-GRAZING = 85.0
-"""Degrees from which the discrepancy grows no more."""
-
-SHORTEST, LEAST_SHORTEST, REACHES = 5.0, 0.05, 16
-"""Shortest length scale in degrees that inducing points carry where measurements reach far, and at least; and how many
-of it there are across measurements that do not reach far."""
-
-FEWEST_NODES, SOME_NODES, MOST_NODES, A_NODE, MOST_ROWS = 80, 160, 250, 50, 400
-"""Inducing points at most: the first with many channels, the third with many measurements, every so many
-of which (the fourth) add one; and the most rows of the matrix, points times channels."""
-
-LOST, LONGER, CANDIDATES = 0.02, 1.25, 4000
-"""Where the points leave more of the variance at a measurement, the shortest length scale grows by the second; chosen
-among at most so many places."""
-
-TYPICAL = 2.0
-"""Measurements are regressed on the points with so many times the shortest length scale."""
-
+LONGEST = 40.0  # degrees: a longer length scale, if its prior is not given, would take the place of the stack's level
+LINEAR_BELOW = 4.0  # standard deviations of the additive noise: the logarithm is linear below
+LEAST_SOFTNESS = 1e-6  # of the median measurement: it is linear below, where nothing is said of additive noise
+GRAZING = 85.0  # degrees from which the discrepancy grows no more
+SHORTEST, LEAST_SHORTEST = 5.0, 0.05  # degrees of the shortest length scale that inducing points carry, and at least
+REACHES = 16  # so many of it there are across measurements that do not reach far
+FEWEST_NODES, MOST_NODES = 80, 250  # inducing points at most, with many channels, and with many measurements
+SOME_NODES, A_NODE = 160, 50  # with few measurements, every so many of which add one
+MOST_ROWS = 400  # of the matrix: points times channels
+LOST, LONGER = 0.02, 1.25  # where points leave more of the variance, the shortest length scale grows by the second
+CANDIDATES = 4000  # places that points are chosen among, at most
+TYPICAL = 2.0  # measurements are regressed on the points with so many times the shortest length scale
 JITTER, ROUNDING, TINY = 1e-8, 1e-10, 1e-9
-LEAST_INFORMATION = 1e-6
-"""Of the information about a parameter of the process: what is kept of its smallest eigenvalue."""
+LEAST_INFORMATION = 1e-6  # about a parameter of the process: what is kept of its smallest eigenvalue
 
 
 # ---- its parameters ----
@@ -73,7 +58,7 @@ class Correlation(NamedTuple):
     channel_correlation: Any
 
 
-ANGLES = (0.1, 360.0)
+ANGLES = (0.1, 360.0)  # degrees of length scales
 RANGES = {"amplitude": (1e-6, 1.0), "grazing_exponent": (0.0, 2.0), "channel_correlation": (0.0, 1.0)}
 
 
@@ -208,11 +193,7 @@ def _pivots(where: Floats, reach: Floats, most: int) -> tuple[list[int], float]:
 
 
 class Whitened(NamedTuple):
-    """Residuals that are independent, of N measurements in C channels, with C R white numbers.
-
-    residuals: z - A c, (N, C). latent: c, (C R,). levels: the logarithms of the diagonal of B's root, (C R,), none
-    below 0.
-    """
+    """Residuals z - A c, (N, C), that are independent; c, (C R,); and log diag C, (C R,), none below 0."""
 
     residuals: Array
     latent: Array
@@ -253,14 +234,11 @@ class Moves(NamedTuple):
 class Process(eqx.Module):
     """A process on R inducing points among the places of N measurements.
 
-    Residuals z of measurements, and `relative`, an error of 1 in the logarithm, are (N, C) and in units of the noise.
+    where: the inducing points, (R, 4), see `places`. weights: (N, R), from these to measurements. shortest: (2,), the
+    shortest length scales that they carry, in degrees of half vector and difference. gram: `gram_of` measurements,
+    (C, R, R), where their noise is known; else None.
 
-    Attributes:
-        where: the inducing points, (R, 4), see `places`.
-        weights: (N, R), from inducing points to measurements.
-        shortest: (2,), what errors reach at least, in degrees of half vector and difference, so that inducing points
-            carry them.
-        gram: `gram_of` measurements, (C, R, R), where their noise is known; else None.
+    Residuals z of measurements, and `relative`, an error of 1 in the logarithm, are (N, C) and in units of the noise.
     """
 
     where: Array
@@ -284,10 +262,8 @@ class Process(eqx.Module):
     def whitened_residuals(self, z: Array, relative: Array, at: Correlation) -> Array:
         """Residuals z (N, C) by the symmetric root of their covariance, K^-1/2 z with K = 1 + A A'.
 
-        Where the model holds they are independent standard normal, and their squares add up to z'K^-1 z. What is left
-        of z beside what the process explains (`whitened`) is neither: the process follows each datum, so that it is
-        smaller than 1, and negatively correlated between neighbours. Leave-one-out residuals (`leave_one_out`) have
-        variance 1, but are correlated, too.
+        Where the model holds they are independent standard normal, and their squares add up to z'K^-1 z. Those of
+        `whitened` are neither, as the process follows each datum; those of `leave_one_out` are correlated.
         """
         factors = self.factors(self._numbers(at, relative.shape[-1]), relative)
         spread, axes = jnp.linalg.eigh(factors.square)
@@ -298,8 +274,7 @@ class Process(eqx.Module):
 
     def leave_one_out(self, whitened_data: Whitened, relative: Array, at: Correlation) -> tuple[Array, Array]:
         """Of each measurement its weighted residual and precision, (N, C): given all others it has mean residual /
-        precision and variance 1 / precision, in units of the noise.
-        """
+        precision and variance 1 / precision, in units of the noise."""
         factors = self.factors(self._numbers(at, relative.shape[-1]), relative)
         parts = relative, factors.channels, self.weights @ factors.points
         rows = at.amplitude * jnp.einsum("nc,cx,nr->ncxr", *parts)

@@ -39,21 +39,20 @@ Transport = lj.Transport | Literal["auto"] | Callable[[Any, Array, Array], Array
 """How the values are computed: a layerjax transport, `"auto"`, or any callable in the place of one.
 
 A callable takes the stack with numbers in place of its free parameters, and unit directions wi and wo, (N, 3) each,
-and returns the BSDF in 1/sr, (N, C). JAX traces and differentiates it, and it must be hashable: functions, `jax.jit` of
-them, `functools.partial`, equinox modules and most objects with `__call__` are.
+and returns the BSDF in 1/sr, (N, C). JAX traces and differentiates it, and it must be hashable, as functions are.
 """
 
 Side = Literal["all", "reflection"]
 
 Step = tuple[Array, Array] | None
-"""Of the first step towards a fit of levels of noise: a scale of it, (N, C), that stands in the place of sigma where it
-is finite, and the share of the model discrepancy that counts; None: all is free."""
+"""What stands in the place of sigma, (N, C), where it is finite, and the share of the model discrepancy that counts, on
+the way to a fit of levels of noise; None: all is free."""
 
 
 class Parts(NamedTuple):
     """What a vector of parameters stands for: the stack, the common scale, and the levels of the noise model.
 
-    instrument: None where there is nothing to say of it. correlation: of the model discrepancy, None without.
+    instrument, correlation: None without an instrument, or a model discrepancy.
     """
 
     stack: Any
@@ -69,23 +68,12 @@ class Model(eqx.Module):
 
     What ends with `_at` takes what the vector predicts, (N, C), beside it, so that nothing is computed twice.
 
-    Attributes:
-        template: the stack, scale and noise levels without their free parameters.
-        box: bounds and priors of the P parameters.
-        wi, wo: directions of the N samples, (N, 3).
-        values: BSDF in C channels, (N, C), in 1/sr.
-        variance: the measurement's own, (N, C), in 1/sr^2.
-        lowest: what sigma cannot fall below, (N, C), in 1/sr.
-        degrees_of_freedom: of Student-t tails.
-        transport: how the values are computed.
-        side: "reflection" if all directions lie above.
-        known: what is known of the directions beforehand.
-        optics: how an instrument sees them, None for exact directions.
-        process: the model discrepancy, None without.
-        softness: of its `logarithm`, (N, C), in 1/sr; None without.
-        objective, tails: see `Problem` and `Noise`.
-        varying: whether sigma depends on the parameters.
-        moving: so many of them come first, on which predictions depend; the others are those of the noise.
+    template: of `Parts`. box: bounds and priors of the P parameters. wi, wo: directions of the N samples, (N, 3).
+    values: BSDF, (N, C), in 1/sr. variance: the measurement's own, (N, C), in 1/sr^2. lowest: what sigma cannot fall
+    below, (N, C), in 1/sr. known: what is known of the directions beforehand. optics: how an instrument sees them, None
+    for exact directions. process: the model discrepancy, with the softness of its `logarithm`, (N, C), in 1/sr; None
+    without. side: "reflection" if all directions lie above. varying: whether sigma depends on the parameters. moving:
+    so many of them come first, on which predictions depend; the others are those of the noise.
     """
 
     template: Template
@@ -270,7 +258,7 @@ class Model(eqx.Module):
 
     def residuals_at(self, vector: Array, predicted: Array, step: Step = None) -> tuple[Array, ...]:
         """Arrays whose half sum of squares is minus the log-posterior up to a constant, or the named objective: of the
-        data, of the prior, and those of levels of noise (see `logarithmic`)."""
+        data, of the prior, and of levels of noise (see `logarithmic`)."""
         if self.objective != "likelihood":
             return (self._named(predicted),)
         sigma = self._noise_at(vector, predicted, step)
@@ -317,9 +305,7 @@ def _(primals: tuple[Array], tangents: tuple[Array], *, model: Model) -> tuple[A
 class JointModel(eqx.Module):
     """Of several data sets, one after the other, (N, 1), the same functions as of one: the product of their densities.
 
-    Attributes:
-        parts: the densities of the data sets.
-        places: for each of them, the places of its parameters in the vector.
+    places: for each data set, the places of its parameters in the vector.
     """
 
     parts: tuple[Model, ...]
@@ -378,7 +364,7 @@ class JointModel(eqx.Module):
         return self._together(vector, [residuals for residuals, _ in found]), (predicted, jnp.concatenate(rows))
 
     def _together(self, vector: Array, each: Sequence[tuple[Array, ...]]) -> tuple[Array, ...]:
-        """Residuals of the data sets as those of all: data, prior, levels of noise."""
+        """Residuals of all: data, prior, levels of noise."""
         levels = [level.reshape(-1) for _, _, *levels in each for level in levels]
         data = jnp.concatenate([residuals[0].reshape(-1) for residuals in each])
         return (data, self.box.prior_residuals(vector), *([jnp.concatenate(levels)] if levels else []))

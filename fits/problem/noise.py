@@ -71,9 +71,8 @@ class Noise:
         if self.discrepancy is True:
             object.__setattr__(self, "discrepancy", Discrepancy())
         if not (self.discrepancy in (False, None) or isinstance(self.discrepancy, Discrepancy)):
-            raise ValueError(
-                f"Noise.discrepancy is {in_short(self.discrepancy)}; it must be true, false or Discrepancy"
-            )
+            given = in_short(self.discrepancy)
+            raise ValueError(f"Noise.discrepancy is {given}; it must be true, false or Discrepancy")
         if self.discrepancy and self.tails != "gaussian":
             raise ValueError(f"Noise.tails is {self.tails!r}; with model discrepancy it must be gaussian")
 
@@ -126,11 +125,8 @@ def information_weights(tails: Tails, degrees_of_freedom: Array) -> tuple[Array,
 
 
 def named_residual(objective: Objective, predicted: Array, values: Array, cosine: Array) -> Array:
-    """Residuals of the literature, model minus datum, that are no likelihood; `cosine` is |cos theta_i|, shape (N, 1).
-
-    cosine_l2: f cos (Ngan 2005); log1p_cos: log(1 + f cos) (Low 2012), with f cos above -1/2; cube_root: the cube root
-    of f cos (after Fores 2012), offset by 1e-6 so that it is smooth at 0.
-    """
+    """Model minus datum in measures of the literature: f cos (Ngan 2005), log(1 + f cos) with f cos above -1/2
+    (Low 2012), or the cube root of f cos + 1e-6 (after Fores 2012); `cosine` is |cos theta_i|, (N, 1)."""
     if objective == "cosine_l2":
         return (predicted - values) * cosine
     if objective == "log1p_cos":
@@ -197,7 +193,5 @@ def require_size(levels: Levels) -> None:
     precision, median = jnp.finfo(jnp.result_type(float)), cast(float, levels.floor) / DEFAULT_FLOOR
     least, most = max(LEVELS[0], math.sqrt(precision.tiny)) / DEFAULT_FLOOR, min(LARGEST, math.sqrt(precision.max))
     if levels.floor and not least <= median <= most:
-        raise ValueError(
-            f"values: the median of |value| is {median:.3g} 1/sr; for noise relative to them it must be in "
-            f"[{least:.2g}, {most:.2g}], or Noise.floor be given"
-        )
+        words = f"for noise relative to them it must be in [{least:.2g}, {most:.2g}], or Noise.floor be given"
+        raise ValueError(f"values: the median of |value| is {median:.3g} 1/sr; {words}")

@@ -1,6 +1,6 @@
 """A fitting problem: stacks, data sets, noise model, instrument; one measurement, or several with parameters in common.
 
-`Problem` and `Joint` are what users and results hold; their `model` holds the same as arrays, for compiled programs.
+`Problem` and `Joint` are what users hold; their `model` holds the same as arrays, for compiled programs.
 """
 
 import abc
@@ -41,6 +41,7 @@ from layerjax.mixture import require_material
 from layerjax.stack import with_known
 from layerjax.transport.known_directions import known_directions
 
+# of parameters by how their names end; all others are plain ratios
 UNITS = {
     "noise.floor": "1/sr",
     "instrument.tilt": "deg",
@@ -51,10 +52,8 @@ UNITS = {
     "mu_s": "1/mm",
     "mu_a": "1/mm",
 }
-"""Units of parameters by how their names end; all others are plain ratios."""
-
+# how names begin of what stands in each place of `Parts`
 PLACES = ("", "scale", "instrument", "noise.relative", "noise.floor", "noise.discrepancy")
-"""How names begin of what stands in each place of `Parts`."""
 
 
 class Assembled(NamedTuple):
@@ -65,11 +64,7 @@ class Assembled(NamedTuple):
 
 
 class FittingProblem(abc.ABC):
-    """One data set or several: parameters in a box, and what the data say of them, as functions of the vector (P,).
-
-    Attributes:
-        problems: a `Problem` for each data set, by its name; one measurement by itself has none: "".
-    """
+    """One data set or several: parameters in a box, and what the data say of them, as functions of the vector (P,)."""
 
     objective: Objective
 
@@ -81,7 +76,7 @@ class FittingProblem(abc.ABC):
     @property
     @abc.abstractmethod
     def problems(self) -> "Mapping[str, Problem]":
-        """A `Problem` for each data set, by its name."""
+        """A `Problem` for each data set, by its name; one measurement by itself has none: ""."""
 
     @abc.abstractmethod
     def with_problems(self, changed: "Mapping[str, Problem]") -> "FittingProblem":
@@ -168,8 +163,8 @@ class FittingProblem(abc.ABC):
         return self.call(Model.log_posterior_unconstrained, u)
 
     def call(self, function: Callable[..., Any], *arguments: Any) -> Any:
-        """`function(model, *arguments)`, compiled once for all of this structure; of a method of `Model` the model's
-        own of that name."""
+        """`function(model, *arguments)`, compiled once for all of this structure; of a `JointModel` its own method of
+        the name of one of `Model`."""
         if function in vars(Model).values():
             function = getattr(type(self.model), function.__name__)
 
@@ -239,7 +234,7 @@ class Problem(FittingProblem):
 
     @property
     def problems(self) -> "dict[str, Problem]":
-        """The one measurement, which has no name."""
+        """The one measurement."""
         return {"": self}
 
     def with_problems(self, changed: "Mapping[str, Problem]") -> "Problem":
@@ -265,7 +260,7 @@ class Problem(FittingProblem):
 
 
 class JointParts(NamedTuple):
-    """What a vector makes of each data set, by its name: stacks, and calibration factors."""
+    """Stacks and calibration factors of data sets, by their names."""
 
     stack: dict[str, Any]
     scale: dict[str, Any]
@@ -329,12 +324,10 @@ class Joint(FittingProblem):
                     raise ValueError(f"Joint.shared: {words} is not free in {part!r}; it must be in every problem")
         common = {name: one for name, one in common.items() if any(_begins(given, name) for given in self.shared)}
         for (name, one), (part, free) in product(common.items(), others):
-            other = free[name]
-            same = one.shape == other.shape and (one.low, one.high, one.prior) == (other.low, other.high, other.prior)
-            if not (same and one.random_walk_sd == other.random_walk_sd):
-                raise ValueError(
-                    f"Joint.shared: {name} has other bounds or another prior in {part!r} than in {first!r}"
-                )
+            own, other = ((of.shape, of.low, of.high, of.prior, of.random_walk_sd) for of in (one, free[name]))
+            if own != other:
+                words = f"{name} has other bounds or another prior in {part!r} than in {first!r}"
+                raise ValueError(f"Joint.shared: {words}")
         return common
 
     def build(self, vector: ArrayLike) -> JointParts:
@@ -495,8 +488,7 @@ def with_floor(noise: Noise, instrument: Instrument | None) -> Noise:
 
 
 def polar_angles(data: Measurements) -> Floats:
-    """Polar angles of the light, (K,), of the used samples, in degrees; within `SAME_ANGLE` they are one, at all
-    azimuths."""
+    """Polar angles of the light, (K,), of the used samples, in degrees; within `SAME_ANGLE` they are one."""
     theta = data.used().theta_i
     return np.round([np.mean(theta[rows]) for rows in groups(theta)], 2)
 

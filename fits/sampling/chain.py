@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 
 from fits.store import Store
 
-SECONDS = 1.0
-"""Between two blocks."""
+SECONDS = 1.0  # between two blocks
 
 
 class Chain(Backend):

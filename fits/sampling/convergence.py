@@ -17,10 +17,8 @@ from fits.sampling.options import FIRST_CHECK, SamplerOptions
 
 GROUPS = 4
 FEWEST_DRAWS = 8
-
-
+# steps after which a chain is looked at, however often a run resumes: 100, 200, ... 1000, then a tenth farther
 CHECKS = FIRST_CHECK * np.unique(np.ceil(1.1 ** np.arange(100.0)).astype(int))
-"""Steps after which a chain is looked at, however often a run resumes: 100, 200, ... 1000, then a tenth farther."""
 
 
 def next_check(step: int) -> int:

@@ -19,12 +19,10 @@ from fits.sampling.mixture import Mixture
 from fits.sampling.options import SamplerOptions
 from fits.sampling.proposals import Density, FittedProposal, propose
 
+# steps after which proposals are fitted again: often while the chain is short, seldom once it is long
 FITS = (25 * 1.5 ** np.arange(40.0)).astype(int)
-"""Steps after which proposals are fitted again: often while the chain is short, seldom once it is long."""
-
+# length of differential evolution; 2.38 is best for a normal posterior, but curved ones are narrower than they are long
 DIFFERENCE = 1.2
-"""Length of differential evolution, where 2.38 is best for a normal posterior: curved ones are narrower than they are
-long."""
 
 
 class Ensemble:

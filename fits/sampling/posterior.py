@@ -14,7 +14,7 @@ from jax import Array
 from fits._lazy import shown_by
 from fits.data.geometry import Floats
 from fits.optimise.result import Fit
-from fits.problem.discrepancy import logarithm
+from fits.problem.discrepancy import Correlation, logarithm
 from fits.problem.model import Model
 from fits.sampling.chain import Chain
 from fits.sampling.convergence import Convergence, after_burn_in
@@ -26,14 +26,12 @@ if TYPE_CHECKING:
     from arviz import InferenceData
 
 REPORTED_DRAWS = 2048
-MODE_STEPS = 1000
-"""Steps of a chain by which shares of modes are estimated."""
+MODE_STEPS = 1000  # of a chain, by which shares of modes are estimated
 
 
 @dataclass(frozen=True)
 class Mode:
-    """A mode of a posterior: the share of it, its standard error as walkers scatter about it, and the mean of the
-    parameters there, by name."""
+    """A mode of a posterior: its share, the standard error of that as walkers scatter, the mean parameters by name."""
 
     share: float
     error: float
@@ -49,13 +47,12 @@ class Posterior:
         log_probability: (steps, walkers), of the unconstrained coordinates, not normalised.
         autocorrelation_time: (P,), in steps, of the chain without its burn-in.
         acceptance: mean share of proposals taken; of NUTS, of steps that moved.
-        converged: without its burn-in the chain is as long as `options` ask for in autocorrelation times of every
-            parameter, and R-hat as near to 1.
+        converged: the chain is as long in autocorrelation times, and R-hat as near to 1, as `options` ask for.
         allow_unconverged: estimates may be had from a chain that has not converged.
         status: what is to be said of the sampler, if anything.
         divergences: trajectories of NUTS, after its warm-up, whose energy diverged.
-        modes: where the fit knows several minima that hold a share of the posterior: these, the largest share first.
-            Estimates are of all of them together. Empty where one is known.
+        modes: the minima of the fit that hold a share of the posterior, the largest first, if there are several.
+            Estimates are of all of them together.
         options: that it was sampled with.
     """
 
@@ -135,9 +132,9 @@ class Posterior:
         """
         self._require_converged()
         kept = after_burn_in(self.chain, self.options).reshape(-1, len(self.names))
-        median, low, high = np.quantile(kept, [0.5, 0.158655, 0.841345], axis=0)
-        rows = np.stack([median, low, high, kept.mean(axis=0), kept.std(axis=0)], axis=-1).tolist()
-        return {name: (row[0], row[1], row[2], row[3], row[4]) for name, row in zip(self.names, rows, strict=True)}
+        quantiles = np.quantile(kept, [0.5, 0.158655, 0.841345], axis=0)
+        columns = np.stack([*quantiles, kept.mean(axis=0), kept.std(axis=0)], axis=-1).tolist()
+        return {name: tuple(row) for name, row in zip(self.names, columns, strict=True)}
 
     @cached_property
     def inference_data(self) -> "InferenceData":
@@ -236,11 +233,8 @@ def _over_samples(model: Model, vectors: Array, white: Array) -> tuple[Array, Ar
     def one(row: tuple[Array, Array]) -> tuple[Array, Array, Array]:
         vector, numbers = row
         predicted = expected = model.predict(vector)
-        if model.process is not None:
-            at = model.build(vector).correlation
-            assert at is not None
-            assert model.softness is not None
-            discrepancy = model.process.sample(numbers, at)
+        if model.process is not None and model.softness is not None:
+            discrepancy = model.process.sample(numbers, cast(Correlation, model.build(vector).correlation))
             expected = model.softness * jnp.sinh(logarithm(predicted, model.softness) + discrepancy)
         return model.log_likelihood_per_datum_at(vector, predicted), expected, model.sigma_at(vector, expected)
 

@@ -16,14 +16,10 @@ from scipy import stats
 from fits.data.geometry import Floats
 from fits.sampling.mixture import NARROWEST, Mixture
 
+# normal scores of the quantiles between which marginal distributions are mapped; the last slopes go on beyond
 SCORES = np.linspace(-2.0, 2.0, 17)
-"""Normal scores of the quantiles between which marginal distributions are mapped; the last slopes go on beyond."""
-
-LINEAR_SHARE = 0.02
-"""Of a map: the linear one, by mean and deviation, without which equal draws would have no slope."""
-
-INITIAL_SHARE = 0.1
-"""Of proposals: those from the approximations of the fit, which know of modes that were not visited."""
+LINEAR_SHARE = 0.02  # of a map: the linear one, by mean and deviation, without which equal draws would have no slope
+INITIAL_SHARE = 0.1  # of proposals: those from the approximations of the fit, which know of modes not visited
 
 
 class Density(Protocol):

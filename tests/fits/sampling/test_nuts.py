@@ -11,7 +11,7 @@ from fits.optimise.result import Fit
 from fits.reports.results import load_posterior, save_fit
 from fits.sampling.nuts import Nuts, _step
 from fits.sampling.posterior import Posterior
-from fits.sampling.sample import load, sample, settings
+from fits.sampling.sample import load, sample, walkers_of
 
 pytest.importorskip("blackjax")
 
@@ -70,7 +70,7 @@ def test_it_goes_on_from_its_file_to_the_same_end(result: Fit, short: Posterior,
 
 
 def test_chains_and_extra_are_there(result: Fit, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert settings(20, "nuts").walkers == 4
+    assert walkers_of(20, "nuts", None) == 4
     with pytest.raises(ValueError, match="walkers is 1; it must be at least 2"):
         sample(result, sampler="nuts", walkers=1)
     monkeypatch.setitem(sys.modules, "blackjax", None)

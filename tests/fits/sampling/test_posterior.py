@@ -22,7 +22,7 @@ from fits.sampling.chain import Chain
 from fits.sampling.ensemble import proposals_of
 from fits.sampling.initial import initial_mixture
 from fits.sampling.options import SamplerOptions
-from fits.sampling.sample import load, sample, settings
+from fits.sampling.sample import load, sample, walkers_of
 from fits.store import Store
 from tests.helpers.models import COUNT, design, line, line_data, line_fit, measured, student_fit
 from tests.helpers.places import ROOT
@@ -277,4 +277,4 @@ def test_refused(result: Fit, options: dict, message: str) -> None:
 
 
 def test_there_are_enough_walkers_for_many_parameters() -> None:
-    assert [settings(count, "emcee").walkers for count in (3, 20)] == [32, 42]
+    assert [walkers_of(count, "emcee", None) for count in (3, 20)] == [32, 42]
