@@ -1,7 +1,7 @@
-"""A fit in four steps: multi-start, polish with uncertainties, resolution, result; and again with model discrepancy.
+"""A fit in four steps: multi-start, polish with uncertainties, resolution, result.
 
-Where nothing is said of a discrepancy, the rule is: the stack is fitted with independent noise; where residuals of
-neighbours along the scans are correlated by more than `FitOptions` allow, it is fitted again with a discrepancy.
+Where nothing is said of a discrepancy, the stack is fitted with independent noise; where residuals of neighbours along
+the scans are correlated by more than `FitOptions` allow, it is fitted again with a discrepancy.
 """
 
 import math
@@ -14,9 +14,9 @@ from typing import Any, NamedTuple, cast
 import jax
 import jax.numpy as jnp
 import numpy as np
-from numpy.typing import NDArray
 
 from fits._files import given_path, require_switch
+from fits.data.geometry import Floats
 from fits.data.measurements import Measurements
 from fits.data.scans import correlation, neighbours
 from fits.data.totals import Totals
@@ -44,8 +44,6 @@ from fits.problem.problem import FittingProblem, Problem
 from fits.progress import Progress, given_progress, silent
 from layerjax._checks import require_count, require_kind, require_seed
 from layerjax.compiling import programs_kept
-
-Floats = NDArray[np.float64]
 
 SAME_AT_MOST = 0.05  # share of its box up to which a standard error counts where minima are compared
 MOST_STARTS = 8  # minima without model discrepancy that the fit with it starts from; of other starts half as many
@@ -109,11 +107,7 @@ def fit(
     require_kind("options", options, FitOptions)
     run = _Run(starts, seed, options, given_progress(progress), checkpoint, screen)
     independent = _fit_from(problem, start_points(problem, starts, seed), run)
-    before = {
-        name: found
-        for name, one in problem.problems.items()
-        if undecided(one) and needs_discrepancy(found := without_discrepancy(independent.part(name)), options)
-    }
+    before = {name: found for name in problem.problems if (found := _refuted(independent.part(name), options))}
     return _with_discrepancy(problem, independent, before, run) if before else independent
 
 
@@ -140,12 +134,6 @@ class _Run(NamedTuple):
     screen: bool = False
 
 
-def undecided(problem: Problem) -> bool:
-    """Whether it is left to the residuals, and could be counted: totals have no neighbours."""
-    possible = problem.noise.tails == "gaussian" and problem.objective == "likelihood"
-    return possible and problem.noise.discrepancy is None and not isinstance(problem.data, Totals)
-
-
 def without_discrepancy(fit: Fit) -> WithoutDiscrepancy:
     """What is to be said of a fit without model discrepancy."""
     pairs = neighbours(fit.problem.data.used(), fit.residuals)
@@ -160,11 +148,16 @@ def without_discrepancy(fit: Fit) -> WithoutDiscrepancy:
     )
 
 
-def needs_discrepancy(independent: WithoutDiscrepancy, options: FitOptions = DEFAULT) -> bool:
-    """Whether residuals of neighbours are correlated."""
-    correlation = independent.residual_autocorrelation
-    clear = correlation * math.sqrt(independent.pairs) > options.autocorrelation_errors
-    return clear and correlation > options.autocorrelation
+def _refuted(independent: Fit, options: FitOptions) -> WithoutDiscrepancy | None:
+    """What is to be said of a fit whose residuals are correlated, where it is left to these; else None."""
+    problem = independent.problem
+    possible = problem.noise.tails == "gaussian" and independent.is_posterior and not isinstance(problem.data, Totals)
+    if problem.noise.discrepancy is not None or not possible:
+        return None
+    found = without_discrepancy(independent)
+    errors = found.residual_autocorrelation * math.sqrt(found.pairs)
+    clear = errors > options.autocorrelation_errors and found.residual_autocorrelation > options.autocorrelation
+    return found if clear else None
 
 
 def _with_discrepancy(

@@ -19,12 +19,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from numpy.typing import NDArray
 
+from fits.data.geometry import Floats
 from fits.problem.model import Model
 from fits.problem.problem import FittingProblem
-
-Floats = NDArray[np.float64]
 
 COST_TOLERANCE = 1e-8  # converged: a full step would gain less in the log-posterior, 1e-4 standard errors
 RELATIVE_TOLERANCE = 1e-10  # or without a likelihood less than this share of the cost
@@ -213,12 +211,11 @@ def _damped_solve(matrix: Array, slope: Array, known: Array, fixed: Array, dampi
 
 
 class Descent(NamedTuple):
-    """Where a descent ended, and what is known there of a model with P parameters: arrays of JAX or of numpy.
+    """Where a descent ended, and what is known there of a model with P parameters: arrays of JAX, or numbers and numpy.
 
-    vector: physical, (P,). cost: infinite where the model has no finite value and Jacobian. steps: in all. converged,
-    max_steps_reached: whether it did, and whether it reached the maximum of steps. gradient: of the cost in the unit
-    box, (P,). root: (P, P), its root' root is the information in the data, in boxes^-2. predicted: (N, C), in 1/sr, NaN
-    with an infinite cost.
+    vector: physical, (P,). cost: infinite where the model has no finite value and Jacobian. steps: in all.
+    gradient: of the cost in the unit box, (P,). root: (P, P), its root' root is the information in the data, in
+    boxes^-2. predicted: (N, C), in 1/sr, NaN with an infinite cost. These are None of an end that was stored.
     """
 
     vector: Any
@@ -226,9 +223,9 @@ class Descent(NamedTuple):
     steps: Any
     converged: Any
     max_steps_reached: Any
-    gradient: Any
-    root: Any
-    predicted: Any
+    gradient: Any = None
+    root: Any = None
+    predicted: Any = None
 
 
 def descend(model: Model, start: Array, fresh: Array, most_steps: Array, tolerance: Array) -> Descent:
@@ -301,7 +298,7 @@ def descent(
 ) -> Descent:
     """`descend`, compiled once for all problems of this structure; numbers in double precision."""
     found = problem.call(descend, start, np.asarray(fresh), np.asarray(most_steps), np.asarray(tolerance))
-    return Descent(*(np.asarray(part, float if jnp.issubdtype(part.dtype, jnp.floating) else None) for part in found))
+    return Descent(*(np.asarray(part, float) if part.ndim else part.item() for part in found))
 
 
 def evaluate_at(problem: FittingProblem, unit: Floats) -> Descent:

@@ -16,10 +16,11 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from numpy.typing import NDArray
 
 import layerjax as lj
-from fits.optimise.multi_start import Optimum, StartOutcome, polish, rough_descent, unit_of
+from fits.data.geometry import Floats
+from fits.optimise.levenberg_marquardt import Descent
+from fits.optimise.multi_start import Optimum, polish, rough_descent, unit_of
 from fits.optimise.options import FitOptions
 from fits.problem.instrument import rings_for
 from fits.problem.model import Model
@@ -36,8 +37,6 @@ MINOR_SHARE = 0.5  # of the numerical error that is allowed: left to nodes or mo
 LEAST_SCATTER = 0.01  # of the data's root mean square: less scatter about a named objective counts as this
 SAME_OUTCOME = 0.01  # of the box: ends that are closer in every parameter are fitted again as one
 MOST_MINIMA = 8  # that are fitted again
-
-Floats = NDArray[np.float64]
 
 
 # ---- of the transport ----
@@ -212,12 +211,6 @@ def rings_of_lobes(problem: Problem, vector: Floats) -> int:
     return rings_for(cast(Any, problem.instrument), parts.instrument, parts.stack, data.wi, data.wo)
 
 
-def error_of_rays(problem: Problem, vector: Floats, predicted: Floats) -> float:
-    """What other rays for the cones change of what a vector predicts at most, in standard deviations of the data."""
-    other = np.asarray(problem.with_other_rays().predict(vector), float)
-    return float(np.max(np.abs(predicted - other) / spread(problem, vector, predicted)))
-
-
 # ---- refinement of an optimum ----
 
 
@@ -294,7 +287,8 @@ def _judged(
         rings = rings_of_lobes(problem, vector) if choice.rays else 0
         if rings > (cast(Any, problem.instrument).rings or 0):
             needed = with_rings(needed, rings)
-        errors.append(error_of_rays(problem, vector, predicted) if needed is problem else np.nan)
+        other = problem.with_other_rays().predict(vector) if needed is problem else np.nan
+        errors.append(float(np.max(np.abs(predicted - np.asarray(other)) / spread(problem, vector, predicted))))
         words.append(_error_in_words(_rings_in_words(problem), errors[-1], False, choice.rays))
     if not errors:
         return problem, None
@@ -327,10 +321,10 @@ def _error_in_words(resolution: str, error: float, finest: bool, is_open: bool) 
     return f"{error:.2g} sigma at most at {resolution}{'' if is_open else ', as given'}"
 
 
-def _fitted_again(at: Optimum, problem: FittingProblem, equivalent: float, progress: Progress) -> list[StartOutcome]:
+def _fitted_again(at: Optimum, problem: FittingProblem, equivalent: float, progress: Progress) -> list[Descent]:
     """The ends at another resolution: those that matter fitted again, the cost of the others there."""
 
-    def with_cost(end: StartOutcome) -> StartOutcome:
+    def with_cost(end: Descent) -> Descent:
         found = float(problem.call(Model.cost_at, end.vector, problem.predict(end.vector)))
         return end._replace(cost=found if np.isfinite(found) else np.inf)
 

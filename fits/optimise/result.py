@@ -6,14 +6,12 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fits._lazy import shown_by
+from fits.data.geometry import Floats
 from fits.optimise.uncertainty import Direction
 from fits.problem.model import Model
 from fits.problem.problem import Problem
-
-Floats = NDArray[np.float64]
 
 # what is said of the starts that ended in each way (see `Fit.start_outcomes`)
 OUTCOMES = {
@@ -156,13 +154,13 @@ class Fit:
         if problems.get("") is not self.problem:
             raise ValueError(f"{what}: of a joint fit it takes a part: fit.part(...) of {', '.join(problems)}")
 
-    def require_alone(self, what: str) -> None:
-        """ValueError, for `what` asks the data anew, of one measurement of several: its problem has no others."""
+    def require_posterior(self, what: str) -> None:
+        """ValueError, for `what` asks for the posterior anew, of a named objective, or of a part of a joint fit."""
+        if not self.is_posterior:
+            raise ValueError(f"{what}: a fit of {self.problem.objective!r} has no noise model, and so no posterior")
         if self.dataset is not None:
-            raise ValueError(
-                f"{what}: {self.dataset!r} is a part of a joint fit, and without the others it says something "
-                "else; fit it by itself, or take the whole fit"
-            )
+            words = "without the others it says something else; fit it by itself, or take the whole fit"
+            raise ValueError(f"{what}: {self.dataset!r} is a part of a joint fit, and {words}")
 
     @property
     def values(self) -> dict[str, float]:

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
+from fits.data.geometry import Floats
 from fits.optimise.levenberg_marquardt import evaluate_at
 from fits.problem.problem import FittingProblem
 
@@ -24,8 +25,6 @@ UNKNOWN_BEYOND = 1e3  # boxes: a larger error is reported as infinite
 LARGEST_ERROR = 1e9  # boxes: stands for all larger ones, so that squares of it can be formed
 CERTAIN_MEMBER = 0.05  # weight from which a parameter belongs to a direction
 MEMBER, OWED = 0.01, 0.25  # weight from which it does so if it owes the direction this share of its variance
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

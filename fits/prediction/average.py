@@ -83,9 +83,8 @@ def average(
         weights = {name: score.weight for name, score in scores.items()}
     total = float(sum(weights.get(name, np.nan) for name in candidates))
     if set(weights) != set(candidates) or min(weights.values()) < 0.0 or not total > 0.0:
-        raise ValueError(
-            f"weights is {dict(weights)}; it must give each of {', '.join(candidates)} a number of at least 0"
-        )
+        words = f"it must give each of {', '.join(candidates)} a number of at least 0"
+        raise ValueError(f"weights is {dict(weights)}; {words}")
     return Average(dict(candidates), {name: weights[name] / total for name in candidates})
 
 

@@ -114,10 +114,8 @@ def _require_comparable(fits: Mapping[str, Fit]) -> None:
         if not all(a.shape == b.shape and np.allclose(a, b, rtol=1e-9, atol=1e-12) for a, b in pairs):
             raise ValueError(f"compare: {first_name!r} and {name!r} were fitted to different data")
         if fit.problem.objective != first.problem.objective:
-            raise ValueError(
-                f"compare: {first_name!r} minimised {first.problem.objective!r}, {name!r} {fit.problem.objective!r}; "
-                "only fits of one objective can be compared"
-            )
+            words = f"{first_name!r} minimised {first.problem.objective!r}, {name!r} {fit.problem.objective!r}"
+            raise ValueError(f"compare: {words}; only fits of one objective can be compared")
 
 
 def _verdict(best: ComparedFit, other: ComparedFit, sorted_by: str, options: ComparisonOptions) -> str:

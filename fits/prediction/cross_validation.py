@@ -22,11 +22,9 @@ from fits.optimise.result import Fit
 from fits.prediction.importance import Evidence, ImportanceDraws, evidence_of, posterior_draws
 from fits.prediction.options import DEFAULT, ComparisonOptions
 from fits.prediction.predict import posterior_predictive
-from fits.problem.discrepancy import size
-from fits.problem.noise import total_sigma
 from fits.problem.problem import Problem
 from fits.progress import Progress, given_progress, named
-from fits.sampling.initial import other_minima, vector_of
+from fits.sampling.initial import other_minima
 from fits.sampling.proposals import Density
 from layerjax._checks import require_count, require_kind, require_seed
 from layerjax.compiling import programs_kept
@@ -99,10 +97,9 @@ def cross_validate(
     groups, data = require_groups(fit, options), fit.problem.data.used()
     proposal = None if posterior is None else posterior.proposal(np.random.RandomState(seed), 2 * draws)
     density, errors, converged = np.zeros(data.values.shape), np.zeros(len(groups)), True
-    starts = [fit.vector, *(vector_of(fit, one) for one in other_minima(fit))]
     for number, (name, rows) in enumerate(groups.items()):
         progress("cross-validation", number, len(groups), name)
-        rest = refit(without(fit.problem, np.isin(np.arange(len(data)), rows)), *starts)
+        rest = refit(without(fit.problem, np.isin(np.arange(len(data)), rows)), fit.vector, *other_minima(fit))
         density[rows], errors[number] = _predictive_density(rest, data, rows, draws, seed, options, proposal)
         converged &= rest.converged
     progress("cross-validation", len(groups), len(groups), "")
@@ -134,11 +131,7 @@ def require_groups(fit: Fit, options: ComparisonOptions | None = None) -> dict[s
     """Rows of a fit's measurements that are held out together, by name. ValueError as of `cross_validate`."""
     require_kind("fit", fit, Fit)
     require_kind("options", options, ComparisonOptions, None)
-    if not fit.is_posterior:
-        raise ValueError(
-            f"cross_validate: a fit of {fit.problem.objective!r} has no noise model and predicts no measurements"
-        )
-    fit.require_alone("cross_validate")
+    fit.require_posterior("cross_validate")
     if fit.problem.problems.get("") is not fit.problem:
         raise ValueError("cross_validate: it takes a fit of one measurement by itself, not a joint one")
     groups = groups_of(fit.problem.data.used(), options or DEFAULT)
@@ -162,13 +155,7 @@ def without(problem: Problem, held_out: ArrayLike) -> Problem:
     model, rows = problem.model, jnp.asarray(held_out)[:, None]
     infinite = INFINITE_NOISE * jnp.max(jnp.abs(model.values) + model.lowest)
     variance, lowest = jnp.where(rows, infinite**2, model.variance), jnp.where(rows, infinite, model.lowest)
-    model = replace(model, variance=variance, lowest=lowest)
-    if model.process is not None and model.process.gram is not None:
-        parts = model.build(jnp.asarray(problem.start))
-        sigma = total_sigma(model.values, model.variance, parts.relative, parts.floor)
-        gram = model.process.gram_of(size(model.values, model.softness) / sigma)
-        model = replace(model, process=replace(model.process, gram=gram))
-    return problem.with_model(model)
+    return problem.with_model(replace(model, variance=variance, lowest=lowest).with_gram())
 
 
 # ---- of several stacks ----

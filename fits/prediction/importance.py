@@ -172,9 +172,7 @@ def evidence(fit: Fit, *, draws: int = DRAWS, seed: int = 0) -> Evidence:
     require_kind("fit", fit, Fit)
     require_count("draws", draws, 2)
     require_seed(seed)
-    if not fit.is_posterior:
-        raise ValueError(f"evidence: a fit of {fit.problem.objective!r} has none, it minimised no likelihood")
-    fit.require_alone("evidence")
+    fit.require_posterior("evidence")
     return evidence_of(posterior_draws(fit, draws, seed))
 
 

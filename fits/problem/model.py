@@ -7,6 +7,8 @@ that of several.
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
+from itertools import pairwise
 from typing import Any, Literal, NamedTuple, cast
 
 import equinox as eqx
@@ -26,7 +28,6 @@ from fits.problem.noise import (
     level_residual,
     log_density,
     named_residual,
-    sigma_residual,
     tail_residual,
     total_sigma,
 )
@@ -103,23 +104,22 @@ class Model(eqx.Module):
         """Half the sum of squared residuals."""
         return 0.5 * jnp.sum(jnp.stack([jnp.sum(part**2) for part in self.residuals_at(vector, predicted)]))
 
-    def log_likelihood_per_datum(self, vector: Array) -> Array:
-        """`log_likelihood_per_datum_at` what these parameters predict."""
-        return self.log_likelihood_per_datum_at(vector, self.predict(vector))
-
     def log_likelihood(self, vector: Array) -> Array:
         """Normalised log-likelihood of all data."""
         return self.log_likelihood_at(vector, self.predict(vector))
-
-    def log_prior(self, vector: Array) -> Array:
-        """Log-density of the physical vector, -inf outside the bounds."""
-        return self.box.log_prior(vector)
 
     def log_posterior_unconstrained(self, u: Array) -> Array:
         """Log-posterior (not normalised) as a density over the unconstrained vector; -inf where undefined."""
         vector = self.box.constrain(u)
         total = self.log_likelihood(vector) + self.box.log_prior(vector) + self.box.log_determinant(u)
         return jnp.where(jnp.isfinite(total), total, -jnp.inf)
+
+    def with_gram(self) -> "Model":
+        """The model with what its measurements say of inducing points, where that depends on no parameter."""
+        if self.process is None or self.varying:
+            return self
+        relative = self._relative_at(self._noise_at(self.box.low, self.values))
+        return replace(self, process=replace(self.process, gram=self.process.gram_of(relative)))
 
     @property
     def places(self) -> tuple[tuple[int, ...], ...]:
@@ -262,7 +262,7 @@ class Model(eqx.Module):
         if self.objective != "likelihood":
             return (self._named(predicted),)
         sigma = self._noise_at(vector, predicted, step)
-        levels = [sigma_residual(sigma, self.lowest)] if self.varying else []
+        levels = [level_residual(jnp.log(jnp.maximum(sigma / self.lowest, 1.0)))] if self.varying else []
         if self.process is None:
             data = tail_residual((predicted - self.values) / sigma, self.tails, self.degrees_of_freedom)
         else:
@@ -313,8 +313,7 @@ class JointModel(eqx.Module):
     places: tuple[tuple[int, ...], ...] = eqx.field(static=True)
     varying: bool = eqx.field(static=True)
 
-    residuals, cost_at, log_prior = Model.residuals, Model.cost_at, Model.log_prior
-    log_likelihood, log_likelihood_per_datum = Model.log_likelihood, Model.log_likelihood_per_datum
+    residuals, cost_at, log_likelihood = Model.residuals, Model.cost_at, Model.log_likelihood
     log_posterior_unconstrained = Model.log_posterior_unconstrained
 
     @property
@@ -356,7 +355,7 @@ class JointModel(eqx.Module):
         """Each data set is differentiated by its own parameters alone."""
         steps: list[Step] = [None] * len(self.parts)
         if step is not None:
-            sigmas = [step[0]] * len(self.parts) if step[0].size == 1 else self._split(step[0])
+            sigmas = [step[0]] * len(self.parts) if step[0].size == 1 else self.split(step[0])
             steps = [(sigma, step[1]) for sigma in sigmas]
         each = self._with_vectors(vector)
         found = [part.linear_parts(own, step) for (part, own), step in zip(each, steps, strict=True)]
@@ -372,15 +371,14 @@ class JointModel(eqx.Module):
     def _with_vectors(self, vector: Array) -> list[tuple[Model, Array]]:
         return [(part, vector[np.array(places)]) for part, places in zip(self.parts, self.places, strict=True)]
 
-    def _split(self, column: Array) -> list[Array]:
+    def split(self, column: Any) -> list[Any]:
         """What of a column (N, 1) belongs to each data set, in the shape of its values."""
-        shapes = [part.values.shape for part in self.parts]
-        split = jnp.split(column[:, 0], np.cumsum([math.prod(shape) for shape in shapes])[:-1])
-        return [share.reshape(shape) for share, shape in zip(split, shapes, strict=True)]
+        ends = pairwise(np.cumsum([0, *(part.values.size for part in self.parts)]))
+        return [column[a:b].reshape(part.values.shape) for part, (a, b) in zip(self.parts, ends, strict=True)]
 
     def _each(self, function: Callable[[Model, Array, Array], Any], vector: Array, predicted: Array) -> list[Any]:
         """What a function says of each data set."""
-        each = zip(self._with_vectors(vector), self._split(predicted), strict=True)
+        each = zip(self._with_vectors(vector), self.split(predicted), strict=True)
         return [function(part, own, share) for (part, own), share in each]
 
 

@@ -23,7 +23,7 @@ from fits._files import require_switch
 from fits.data.geometry import Floats
 from fits.data.measurements import LARGEST, Measurements
 from fits.names import Objective
-from fits.problem.discrepancy import Discrepancy, Process, size, softness
+from fits.problem.discrepancy import Discrepancy, softness
 from fits.problem.parameters import Free, is_free, require_number_or_free
 from layerjax._checks import in_short, require_choice, require_number
 
@@ -106,13 +106,8 @@ def tail_residual(z: Array, tails: Tails, degrees_of_freedom: Array) -> Array:
     return z * jnp.sqrt((nu + 1) / nu * jnp.where(x > TINY, jnp.log1p(tame) / tame, 1.0))
 
 
-def sigma_residual(sigma: Array, lowest: Array) -> Array:
-    """Residual whose half square is log(sigma / lowest) + 1/2; at least 1, so that its slope is finite."""
-    return level_residual(jnp.log(jnp.maximum(sigma / lowest, 1.0)))
-
-
 def level_residual(level: Array) -> Array:
-    """Residual whose half square is a level + 1/2, which is at least 0."""
+    """Residual whose half square is a level of at least 0, + 1/2; at least 1, so that its slope is finite."""
     return jnp.sqrt(1.0 + 2.0 * level)
 
 
@@ -161,14 +156,6 @@ class Levels(NamedTuple):
         """The softness of the logarithms of measurements (N, C), see `fits.problem.discrepancy`."""
         floor = self.floor.start if isinstance(self.floor, Free) else self.floor
         return softness(values, np.sqrt(self.variance + np.square(floor)))
-
-    def gram(self, process: Process, values: Floats) -> Array | None:
-        """What measurements (N, C) tell of a process of the discrepancy; None where it depends on parameters."""
-        if self.fitted:
-            return None
-        variance, relative, floor = map(jnp.asarray, self)
-        sigma = total_sigma(jnp.asarray(values), variance, relative, floor)
-        return process.gram_of(size(values, self.softness(values)) / sigma)
 
 
 def is_assumed(noise: Noise, used: Measurements) -> bool:

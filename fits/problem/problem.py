@@ -5,7 +5,6 @@
 
 import abc
 import copy
-import math
 import re
 import warnings
 from collections.abc import Callable, Mapping, Sequence
@@ -130,9 +129,8 @@ class FittingProblem(abc.ABC):
 
     def shares(self, predicted: Floats) -> dict[str, Floats]:
         """What `predict` gives of each data set, in the shape of its data."""
-        shapes = [problem.model.values.shape for problem in self.problems.values()]
-        split = np.split(predicted.ravel(), np.cumsum([math.prod(shape) for shape in shapes])[:-1])
-        return {name: part.reshape(shape) for name, part, shape in zip(self.problems, split, shapes, strict=True)}
+        split = self.model.split(predicted) if len(self.problems) > 1 else [predicted]
+        return dict(zip(self.problems, split, strict=True))
 
     def build(self, vector: ArrayLike) -> Any:
         """Stack, scale and noise levels with the physical vector (P,)."""
@@ -141,26 +139,6 @@ class FittingProblem(abc.ABC):
     def predict(self, vector: ArrayLike) -> Array:
         """Scaled BSDF of the used samples, (N, C), in 1/sr; of several data sets one after the other, (N, 1)."""
         return self.call(Model.predict, vector)
-
-    def residuals(self, vector: ArrayLike) -> Array:
-        """All residuals of the least-squares problem, (rows,): half their sum of squares is what a fit minimises."""
-        return jnp.concatenate([part.reshape(-1) for part in self.call(Model.residuals, vector)])
-
-    def log_likelihood(self, vector: ArrayLike) -> Array:
-        """Normalised log-likelihood of the used samples with the physical vector (P,)."""
-        return self.call(Model.log_likelihood, vector)
-
-    def log_likelihood_per_datum(self, vector: ArrayLike) -> Array:
-        """Normalised log-density of each datum with the physical vector (P,), (N, C)."""
-        return self.call(Model.log_likelihood_per_datum, vector)
-
-    def log_prior(self, vector: ArrayLike) -> Array:
-        """Log-density of the physical vector, -inf outside the bounds."""
-        return self.call(Model.log_prior, vector)
-
-    def log_posterior_unconstrained(self, u: ArrayLike) -> Array:
-        """Log-posterior over the unconstrained vector (P,), -inf where undefined."""
-        return self.call(Model.log_posterior_unconstrained, u)
 
     def call(self, function: Callable[..., Any], *arguments: Any) -> Any:
         """`function(model, *arguments)`, compiled once for all of this structure; of a `JointModel` its own method of
@@ -366,7 +344,6 @@ def _assemble(problem: Problem) -> Assembled:
     process = correlation = setting = None
     if isinstance(noise.discrepancy, Discrepancy):
         process = make_process(used.wi, used.wo, used.values.shape[1])
-        process = replace(process, gram=levels.gram(process, used.values))
         correlation = numbers_of(noise.discrepancy, np.asarray(process.shortest), used.values.shape[1])
     if problem.instrument is not None:
         setting = setting_of(problem.instrument, polar_angles(problem.data))
@@ -395,7 +372,7 @@ def _assemble(problem: Problem) -> Assembled:
         varying=levels.varying if process is None else levels.fitted,
         moving=sum(not name.startswith("noise.") for name in names),
         **_directions(problem, used.wi, used.wo),
-    )
+    ).with_gram()
     start = jnp.asarray(np.concatenate([entry.arrays()[0].ravel() for entry in free.values()]))
     material = model.build(start).stack
     if isinstance(material, lj.Stack | lj.Mixture):

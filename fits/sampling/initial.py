@@ -17,7 +17,7 @@ from scipy.special import logit, logsumexp
 
 from fits.data.geometry import Floats
 from fits.optimise.multi_start import least_squares_descent, unit_of
-from fits.optimise.result import Fit, Minimum
+from fits.optimise.result import Fit
 from fits.optimise.uncertainty import local_information, uncertainty
 from fits.problem.compilation import cores, in_shares
 from fits.problem.model import Model
@@ -45,8 +45,8 @@ def initial_mixture(
     """
     problem = fit.problem
     found = [_about(problem, fit.vector, np.isin(problem.names, fit.at_bound), share, along_ridges)]
-    for minimum in other_minima(fit):
-        end = least_squares_descent(problem, unit_of(problem, vector_of(fit, minimum)), fresh=False)
+    for vector in other_minima(fit):
+        end = least_squares_descent(problem, unit_of(problem, vector), fresh=False)
         position = logit(np.clip(unit_of(problem, end.vector), INSIDE, 1.0 - INSIDE))[None]
         near = any(np.min(one.squared_distance(position)) < APART**2 for one in found)
         if near or end.cost >= fit.cost + LOWEST_MINIMUM:
@@ -113,16 +113,10 @@ def normal_draws(fit: Fit, count: int, generator: np.random.RandomState) -> Floa
     return drawn
 
 
-def other_minima(fit: Fit) -> list[Minimum]:
-    """Minima of a likelihood's fit, beside the best, that its posterior may have a mode at."""
-    if not fit.is_posterior:
-        return []
-    return [one for one in fit.minima[1:] if one.cost < fit.cost + LOWEST_MINIMUM][: MOST_MODES - 1]
-
-
-def vector_of(fit: Fit, minimum: Minimum) -> Floats:
-    """The values of a minimum of a fit, (P,)."""
-    return np.array([minimum.values[name] for name in fit.problem.names])
+def other_minima(fit: Fit) -> list[Floats]:
+    """The minima of a fit, (P,) each, beside the best, that its posterior may have a mode at."""
+    close = [one for one in fit.minima[1:] if one.cost < fit.cost + LOWEST_MINIMUM]
+    return [np.array([one.values[name] for name in fit.problem.names]) for one in close[: MOST_MODES - 1]]
 
 
 def log_posteriors(problem: FittingProblem, positions: Floats, share: int, compiled: bool = False) -> Floats:
@@ -149,6 +143,4 @@ def first_positions(
         positions = mixture.draw(generator, walkers, float(shrink))
         if np.all(np.isfinite(log_posterior(positions))):
             return positions
-    raise ValueError(
-        "sampling: points next to the optimum have posterior zero; the model gives values that are not finite"
-    )
+    raise ValueError("sampling: the posterior next to the optimum is zero; the model gives values that are not finite")

@@ -72,9 +72,7 @@ def sample(
         OSError: the disk is full, say. What was sampled is kept.
     """
     require_kind("fit", fit, Fit)
-    if not fit.is_posterior:
-        raise ValueError(f"objective {fit.problem.objective!r} is no likelihood, so there is no posterior to sample")
-    fit.require_alone("sample")
+    fit.require_posterior("sample")
     require_seed(seed)
     require_switch("resume", resume)
     require_switch("allow_unconverged", allow_unconverged)

@@ -122,12 +122,12 @@ def test_likelihoods_of_all_and_of_each_given_the_others_are_those_of_the_dense_
         mean, covariance = dense(of, vector)
         expected = stats.multivariate_normal(mean, covariance).logpdf(where) + np.sum(slopes)
         # the kernels' jitter is 1e-8 of variances up to 1e3 times those of the noise
-        assert float(of.log_likelihood(vector)) == pytest.approx(expected, abs=1e-3)
+        assert float(of.call(Model.log_likelihood, vector)) == pytest.approx(expected, abs=1e-3)
     mean, covariance = dense(of, of.start)
     precision = np.linalg.inv(covariance)
     width = 1.0 / np.sqrt(np.diagonal(precision))
     expected = stats.norm.logpdf(precision @ (where - mean) * width) - np.log(width) + slopes
-    found = of.log_likelihood_per_datum(of.start)
+    found = of.call(Model.log_likelihood_per_datum_at, of.start, of.predict(of.start))
     np.testing.assert_allclose(np.ravel(found), expected, atol=1e-4)
 
 
@@ -191,10 +191,11 @@ def test_errors_elsewhere_are_those_of_regression() -> None:
 def test_half_squares_are_minus_the_log_posterior() -> None:
     of = problem("two planes", 2)
     vectors = np.random.default_rng(1).uniform(of.low, of.high, (5, len(of.start)))
-    halves = [0.5 * float(np.sum(np.square(of.residuals(vector)))) for vector in vectors]
+    halves = [float(of.call(Model.cost_at, vector, of.predict(vector))) for vector in vectors]
     box = of.model.box
     heights = [
-        float(of.log_likelihood(vector)) - 0.5 * float(np.sum(box.prior_residuals(jnp.asarray(vector)) ** 2))
+        float(of.call(Model.log_likelihood, vector))
+        - 0.5 * float(np.sum(box.prior_residuals(jnp.asarray(vector)) ** 2))
         for vector in vectors
     ]
     np.testing.assert_allclose(np.add(halves, heights), halves[0] + heights[0], rtol=1e-10)
@@ -233,7 +234,7 @@ def test_derivatives_at_the_ends(end: str, relative: float | Free) -> None:
             ends = [vector.copy(), vector.copy(), vector.copy()]
             ends[1][index] += step
             ends[2][index] += 2.0 * step
-            low, middle, high = (float(of.log_likelihood(entry)) for entry in ends)
+            low, middle, high = (float(of.call(Model.log_likelihood, entry)) for entry in ends)
             assert slope[index] == pytest.approx((4.0 * middle - 3.0 * low - high) / (2.0 * step), rel=1e-4, abs=1e-3)
 
 

@@ -11,6 +11,7 @@ import pytest
 from scipy import integrate, stats
 
 import layerjax as lj
+from fits.problem.model import Model
 from fits.problem.noise import (
     Noise,
     information_weights,
@@ -90,10 +91,12 @@ def test_problem_against_a_likelihood_written_out(name: str) -> None:
         sigma = np.sqrt((SIGMA**2 if noise.use_sigma else 0.0) + (relative * predicted) ** 2 + floor**2)
         law = stats.norm if noise.tails == "gaussian" else stats.t(3.0)
         each = law.logpdf((VALUES - predicted) / sigma) - np.log(sigma)
-        np.testing.assert_allclose(problem.log_likelihood_per_datum(vector), each, rtol=1e-10)
-        assert float(problem.log_likelihood(vector)) == pytest.approx(each.sum(), rel=1e-12)
+        np.testing.assert_allclose(
+            problem.call(Model.log_likelihood_per_datum_at, vector, problem.predict(vector)), each, rtol=1e-10
+        )
+        assert float(problem.call(Model.log_likelihood, vector)) == pytest.approx(each.sum(), rel=1e-12)
         priors = stats.norm.logpdf(named["['b']"], 0.3, 0.5) + stats.norm.logpdf(np.log(named["scale"]), 0, 0.1)
-        half = 0.5 * float(np.sum(np.square(problem.residuals(vector))))
+        half = float(problem.call(Model.cost_at, vector, problem.predict(vector)))
         offsets.append(half + each.sum() + priors)
     assert np.ptp(offsets) < 1e-9 * max(1.0, abs(offsets[0]))
 
@@ -104,11 +107,11 @@ def test_posterior_density_is_likelihood_prior_and_map() -> None:
     prior = stats.loguniform(0.01, 2.0).logpdf(0.5) + stats.truncnorm(-2.6, 1.4, 0.3, 0.5).logpdf(0.2)
     share = np.array([np.log(0.5 / 0.01) / np.log(200.0), 1.2 / 2.0])
     slopes = np.array([0.5 * np.log(200.0), 2.0]) * share * (1 - share)
-    expected = float(problem.log_likelihood(vector)) + prior + np.sum(np.log(slopes))
+    expected = float(problem.call(Model.log_likelihood, vector)) + prior + np.sum(np.log(slopes))
     u = np.log(share) - np.log1p(-share)
-    assert float(problem.log_posterior_unconstrained(u)) == pytest.approx(expected, rel=1e-12)
+    assert float(problem.call(Model.log_posterior_unconstrained, u)) == pytest.approx(expected, rel=1e-12)
     for far in (np.array([np.nan, 0.0]), np.array([np.inf, 0.0])):
-        assert float(problem.log_posterior_unconstrained(far)) == -np.inf
+        assert float(problem.call(Model.log_posterior_unconstrained, far)) == -np.inf
 
 
 def test_masked_samples_never_enter_and_noise_is_five_per_cent_by_default() -> None:
@@ -117,11 +120,13 @@ def test_masked_samples_never_enter_and_noise_is_five_per_cent_by_default() -> N
     clean, masked = (Problem(STACK, measured(values, SIGMA, mask), line) for values in (VALUES, spoiled))
     vector = np.array([0.5, 0.2])
     assert clean.count == COUNT - COUNT // 4
-    np.testing.assert_array_equal(clean.residuals(vector), masked.residuals(vector))
+    np.testing.assert_array_equal(*(one.call(Model.residuals, vector)[0] for one in (clean, masked)))
     predicted = (design(COUNT) @ vector)[:, None]
     sigma = np.hypot(0.05 * predicted, 1e-4 * np.median(np.abs(VALUES)))
     problem = Problem(STACK, measured(VALUES), line)
-    assert float(problem.log_likelihood(vector)) == pytest.approx(stats.norm.logpdf(VALUES, predicted, sigma).sum())
+    assert float(problem.call(Model.log_likelihood, vector)) == pytest.approx(
+        stats.norm.logpdf(VALUES, predicted, sigma).sum()
+    )
 
 
 def test_named_residuals() -> None:

@@ -265,7 +265,7 @@ def test_free_student_noise_is_sampled() -> None:
         ({"walkers": 17}, "walkers is 17"),
         ({"ess": 0.0}, r"ess is 0.0; it must be a number in \(0, inf\)"),
         ({"max_steps": 10}, "max_steps: 10 is not a whole number of at least 100"),
-        ({"objective": "cosine_l2"}, "'cosine_l2' is no likelihood, so there is no posterior"),
+        ({"objective": "cosine_l2"}, "sample: a fit of 'cosine_l2' has no noise model, and so no posterior"),
         ({"sampler": "gibbs"}, "sampler is 'gibbs'; it must be one of emcee, nuts"),
     ],
 )
