@@ -12,7 +12,7 @@ from fits.optimise.result import Fit
 from fits.prediction.cross_validation import ModelScore, model_scores
 from fits.prediction.options import DEFAULT, ComparisonOptions
 from fits.progress import Progress
-from fits.sampling.posterior import Posterior, require_fits
+from fits.sampling.posterior import Posterior
 from layerjax._checks import require_kind
 from layerjax.compiling import programs_kept
 
@@ -59,7 +59,10 @@ class Comparison:
 
 
 def fits_of(candidates: Mapping[str, Fit | Posterior]) -> dict[str, Fit]:
-    """The fits among the candidates, and those of posteriors."""
+    """The fits among the candidates, and those of posteriors. ValueError for anything else."""
+    require_kind("candidates", candidates, Mapping)
+    for name, one in candidates.items():
+        require_kind(f"candidates[{name!r}]", one, Fit, Posterior)
     return {name: one.fit if isinstance(one, Posterior) else one for name, one in candidates.items()}
 
 
@@ -84,12 +87,12 @@ def compare(
         ValueError: fewer than two candidates, different data, different objectives, or joint fits; a part of one may be
             compared, but not with `refit`.
     """
-    require_fits(candidates)
+    fits = fits_of(candidates)
     require_kind("options", options, ComparisonOptions, None)
     require_switch("refit", refit)
     if len(candidates) < 2:
         raise ValueError(f"compare: {len(candidates)} candidate(s) given; at least 2 are needed")
-    fits, options = fits_of(candidates), options or DEFAULT
+    options = options or DEFAULT
     _require_comparable(fits)
     rows = [ComparedFit(name, fit) for name, fit in fits.items()]
     if refit:

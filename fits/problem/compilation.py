@@ -64,30 +64,27 @@ class _Limit:
     limited: Any = None
 
 
+# threadpoolctl 3.7 and later ignores, without a word, all threads but the first that set a limit, until this is called
+_free_limits = getattr(OpenBLASController, "clear_controlling_thread", lambda force: None)
+
+
 @contextmanager
 def one_thread() -> Iterator[None]:
     """LAPACK by one thread: those of a small matrix wait for each other busily, a hundredfold beside other work."""
-    _count(1)
+    with _Limit.lock:
+        if _Limit.calls == 0:
+            _free_limits(force=True)
+            _Limit.limited = _libraries().limit(limits=1)
+        _Limit.calls += 1
     try:
         yield
     finally:
-        _count(-1)
-
-
-def _count(change: int) -> None:
-    with _Limit.lock:
-        before, _Limit.calls = _Limit.calls, _Limit.calls + change
-        if before and _Limit.calls:
-            return
-        if hasattr(OpenBLASController, "clear_controlling_thread"):
-            # threadpoolctl 3.7 and later ignores, without a word, all threads but the first that set a limit
-            OpenBLASController.clear_controlling_thread(force=True)
-        if _Limit.calls:
-            _Limit.limited = _libraries().limit(limits=1)
-        else:
-            _Limit.limited.restore_original_limits()
-            if hasattr(OpenBLASController, "clear_controlling_thread"):
-                OpenBLASController.clear_controlling_thread(force=True)
+        with _Limit.lock:
+            _Limit.calls -= 1
+            if _Limit.calls == 0:
+                _free_limits(force=True)
+                _Limit.limited.restore_original_limits()
+                _free_limits(force=True)
 
 
 @cache

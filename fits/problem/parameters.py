@@ -319,10 +319,8 @@ class Box(eqx.Module):
     def of(cls, free: Iterable[Free]) -> "Box":
         """The box of these parameters, one after the other."""
         free = list(free)
-        bounds = [entry.arrays() for entry in free]
-        low = np.concatenate([np.ravel(b[1]) for b in bounds]) if bounds else np.zeros(0)
-        high = np.concatenate([np.ravel(b[2]) for b in bounds]) if bounds else np.zeros(0)
-        priors = [entry.prior for entry, b in zip(free, bounds, strict=True) for _ in range(b[0].size)]
+        low, high = (np.concatenate([np.zeros(0), *(np.ravel(entry.arrays()[k]) for entry in free)]) for k in (1, 2))
+        priors = [entry.prior for entry in free for _ in range(math.prod(entry.shape))]
         gaussians = np.array([prior.gaussian() for prior in priors]).reshape(-1, 2)
         logs = np.array([_log_normaliser(prior, a, b) for prior, a, b in zip(priors, low, high, strict=True)])
         differences = [np.zeros((0, len(low)))]

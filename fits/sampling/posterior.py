@@ -1,7 +1,6 @@
 """What a chain of samples says about the parameters of a fit: estimates, predictions, and how far to trust them."""
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, cast
@@ -20,7 +19,6 @@ from fits.sampling.chain import Chain
 from fits.sampling.convergence import Convergence, after_burn_in
 from fits.sampling.mixture import Mixture
 from fits.sampling.options import SamplerOptions
-from layerjax._checks import require_kind
 
 if TYPE_CHECKING:
     from arviz import InferenceData
@@ -243,10 +241,3 @@ def _over_samples(model: Model, vectors: Array, white: Array) -> tuple[Array, Ar
 
 def _constrained(model: Model, positions: Array) -> Array:
     return jax.vmap(model.box.constrain)(positions)
-
-
-def require_fits(candidates: object) -> None:
-    """Refuse what are no fits or posteriors by name."""
-    require_kind("candidates", candidates, Mapping)
-    for name, one in cast(Mapping[str, object], candidates).items():
-        require_kind(f"candidates[{name!r}]", one, Fit, Posterior)
