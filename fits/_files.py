@@ -52,9 +52,9 @@ def write_text(path: str | Path, text: str, force: bool = False) -> None:
     write_bytes(path, text.encode(), force)
 
 
-def write_bytes(path: str | Path, content: bytes, force: bool = False, durable: bool = False) -> None:
+def write_bytes(path: str | Path, content: bytes, force: bool = False) -> None:
     """Write a file atomically, by a temporary one beside it; an existing file is a ValueError unless `force`. An
-    OSError names the file. durable: the content has reached the disk before it replaces an existing file."""
+    OSError names the file."""
     path = given_path("path", path)
     require_switch("force", force)
     if path.exists() and not force:
@@ -66,9 +66,6 @@ def write_bytes(path: str | Path, content: bytes, force: bool = False, durable: 
         try:
             with os.fdopen(descriptor, "wb") as file:
                 file.write(content)
-                if durable:
-                    file.flush()
-                    os.fsync(file.fileno())
             os.chmod(temporary, permissions(0o666))  # mkstemp makes files that only their owner can read
             os.replace(temporary, path)
         except BaseException:

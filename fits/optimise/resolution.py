@@ -63,11 +63,11 @@ class Resolutions:
     def far(self) -> lj.AddingDoubling:
         """The resolution that starts are fitted at: the chosen one, but no finer than is of use there."""
         least = {name: min(getattr(self.chosen, name), most) for name, most in FAR.items()}
-        return self._as_given(replace(self.chosen, **least))
+        return self.as_stated(replace(self.chosen, **least))
 
     def finer(self, transport: lj.AddingDoubling) -> lj.AddingDoubling | None:
         """The transport at the next finer resolution; None beyond the finest that is chosen."""
-        finer = self._as_given(transport.finer())
+        finer = self.as_stated(transport.finer())
         if self.open and not self.tilted:  # what is as fine as it gets stays, the other is refined
             nodes, modes = transport.nodes or 0, transport.modes or 0
             finer = replace(
@@ -86,17 +86,13 @@ class Resolutions:
         parts = [replace(transport, modes=finer.modes), replace(transport, nodes=finer.nodes)]
         return [part for part in parts if part not in (transport, finer)]
 
-    def coarser(self, transport: lj.AddingDoubling) -> lj.AddingDoubling:
-        """The transport at the next coarser resolution."""
-        return self._as_given(transport.coarser())
-
     def in_words(self, transport: lj.AddingDoubling) -> str:
         """Such as "12 nodes, 16 modes"."""
         if self.tilted:
             return "{} cosines, {} azimuths".format(*transport.ordinates or ("?", "?"))
         return f"{transport.nodes} nodes, {transport.modes} modes"
 
-    def _as_given(self, transport: lj.AddingDoubling) -> lj.AddingDoubling:
+    def as_stated(self, transport: lj.AddingDoubling) -> lj.AddingDoubling:
         """The transport with what the user gave put back in; unchanged where the user left nothing to choose."""
         if not self.open:
             return transport
@@ -175,7 +171,7 @@ def needed_resolution(
     """The coarsest resolution from this one on that is fine enough, its error, and whether none is finer."""
     finer = known.finer(transport)
     if finer is None:
-        return transport, error(known.coarser(transport), transport), True
+        return transport, error(known.as_stated(transport.coarser()), transport), True
     found = error(transport, finer)
     while known.open and found > allowed:
         parts = known.partly_finer(transport, finer)

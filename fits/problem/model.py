@@ -312,14 +312,10 @@ class JointModel(eqx.Module):
     box: Box
     places: tuple[tuple[int, ...], ...] = eqx.field(static=True)
     varying: bool = eqx.field(static=True)
+    objective: Objective = eqx.field(static=True, default="likelihood")  # which weighs data sets by their noise
 
     residuals, cost_at, log_likelihood = Model.residuals, Model.cost_at, Model.log_likelihood
     log_posterior_unconstrained = Model.log_posterior_unconstrained
-
-    @property
-    def objective(self) -> Objective:
-        """Data sets are weighed against each other by their noise."""
-        return "likelihood"
 
     @property
     def values(self) -> Array:
@@ -338,9 +334,6 @@ class JointModel(eqx.Module):
 
     def whitened_residuals_at(self, vector: Array, predicted: Array) -> Array:
         return _column(self._each(Model.whitened_residuals_at, vector, predicted))
-
-    def log_likelihood_per_datum_at(self, vector: Array, predicted: Array) -> Array:
-        return _column(self._each(Model.log_likelihood_per_datum_at, vector, predicted))
 
     def chi_square_at(self, vector: Array, predicted: Array) -> Array:
         return jnp.sum(jnp.stack(self._each(Model.chi_square_at, vector, predicted)))

@@ -60,20 +60,14 @@ class Ensemble:
 
     def _first_state(self) -> emcee.State:
         generator = np.random.RandomState(self.seed)
-        positions = first_positions(
-            Mixture(**self.chain.moves["initial"]), self.log_posteriors, self.chain.shape[0], generator
-        )
+        initial = Mixture(**self.chain.moves["initial"])
+        positions = first_positions(initial, self.log_posteriors, self.chain.shape[0], generator)
         return emcee.State(positions, random_state=generator.get_state())  # else emcee copies numpy's global state
 
 
 def proposals_of(chain: Chain, fewest: int = 1) -> Density:
-    """What proposals are drawn from until the next fit: fitted to the second half of the chain up to the last one.
-
-    fewest: draws that they are fitted to, at least.
-
-    As fits grow apart, so the adaptation fades; and a chain that is gone on with is the same, for it depends on whole
-    fits only.
-    """
+    """What proposals are drawn from until the next fit: fitted to the second half of the chain up to the last one, of
+    so many draws at least. As fits grow apart, adaptation fades; a chain that resumes depends on whole fits only."""
     initial, last = Mixture(**chain.moves["initial"]), FITS[chain.iteration >= FITS].max(initial=0)
     if (last - last // 2) * chain.shape[0] < fewest:
         return initial
