@@ -1,8 +1,8 @@
 """The starts of a fit: where they begin, where each of them ends, and the lowest followed to its very minimum.
 
-Levenberg-Marquardt follows them. L-BFGS-B of scipy, by jaxopt and with gradients only, shares nothing with it but the
-objective: it checks a minimum that lies on a bound or has not converged. A start that reaches the maximum of steps is
-continued while it gains something: the number of steps says nothing about how good its outcome is.
+Levenberg-Marquardt follows them, and continues a start that reaches the maximum of steps while it gains something.
+L-BFGS-B of scipy, by jaxopt and with gradients only, shares nothing with it but the objective: it checks a minimum that
+lies on a bound or has not converged.
 """
 
 import warnings

@@ -104,9 +104,8 @@ class Fit:
     dataset: str | None = None
 
     def __repr__(self) -> str:
-        values = ", ".join(
-            f"{name} {value:.4g} ± {self.standard_errors[name]:.2g}" for name, value in self.values.items()
-        )
+        numbers = zip(self.problem.names, self.vector, self.errors, strict=True)
+        values = ", ".join(f"{name} {value:.4g} ± {error:.2g}" for name, value, error in numbers)
         return f"<Fit to {self.problem.count} measurements: {values}; {self.status}>"
 
     def _repr_html_(self) -> str:
@@ -127,9 +126,9 @@ class Fit:
         def names(some: tuple[str, ...]) -> tuple[str, ...]:
             return tuple(called[name] for name in some if name in called)
 
-        def minima(some: tuple[Minimum, ...]) -> tuple[Minimum, ...]:
-            values = [{plain: one.values[whole] for whole, plain in called.items()} for one in some]
-            return tuple(replace(one, values=v, stack=one.stack[name]) for one, v in zip(some, values, strict=True))
+        def minimum(one: Minimum) -> Minimum:
+            values = {plain: one.values[whole] for whole, plain in called.items()}
+            return replace(one, values=values, stack=one.stack[name])
 
         found = replace(
             self,
@@ -140,8 +139,8 @@ class Fit:
             at_bound=names(self.at_bound),
             insensitive=names(self.insensitive),
             unidentified=tuple(one.renamed(called) for one in self.unidentified if set(one.weights) & set(called)),
-            minima=minima(self.minima),
-            alternatives=minima(self.alternatives),
+            minima=tuple(map(minimum, self.minima)),
+            alternatives=tuple(map(minimum, self.alternatives)),
             without_discrepancy=self.without_discrepancy_parts.get(name),
             dataset=name,
         )

@@ -128,10 +128,8 @@ def _verdict(best: ComparedFit, other: ComparedFit, sorted_by: str, options: Com
     log-likelihood are then divided by its reduced chi-square (Burnham & Anderson 2002, Sec. 2.5, QAIC).
     """
     if sorted_by == "chi_square":
-        return (
-            f"{best.name} has a lower chi-square than {other.name}; without a likelihood the difference has no "
-            "significance."
-        )
+        words = "without a likelihood the difference has no significance"
+        return f"{best.name} has a lower chi-square than {other.name}; {words}."
     if (score := other.model_score) is not None:
         difference = 2.0 * score.clear_diff
         words = f"elpd difference {score.elpd_diff:.1f} ± {score.dse:.1f} by cross-validation"

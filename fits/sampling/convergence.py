@@ -28,11 +28,8 @@ def next_check(step: int) -> int:
 
 @dataclass(frozen=True, eq=False)
 class Convergence:
-    """How far a chain of P parameters has come, by its draws after the burn-in.
-
-    draws: steps after the burn-in. autocorrelation_time: (P,), in steps. ess: (P,), the smaller of bulk and tail.
-    r_hat: (P,).
-    """
+    """How far a chain of P parameters has come, by its `draws`, steps after the burn-in; autocorrelation time in steps,
+    ESS, the smaller of bulk and tail, and R-hat, (P,) each."""
 
     draws: int
     autocorrelation_time: Floats

@@ -80,9 +80,8 @@ class Posterior:
         fit = self.fit.part(name)
         own = list(self.fit.problem.places(name))
         whole = {plain: self.names[place] for plain, place in zip(fit.problem.names, own, strict=True)}
-        modes = tuple(
-            replace(mode, values={plain: mode.values[name] for plain, name in whole.items()}) for mode in self.modes
-        )
+        values = [{plain: mode.values[name] for plain, name in whole.items()} for mode in self.modes]
+        modes = tuple(replace(mode, values=its) for mode, its in zip(self.modes, values, strict=True))
         time = self.autocorrelation_time[own]
         return replace(self, fit=fit, chain=self.chain[..., own], autocorrelation_time=time, modes=modes)
 

@@ -40,10 +40,8 @@ def propose(density: Density, positions: Floats, generator: np.random.RandomStat
 
 @dataclass(frozen=True, eq=False)
 class FittedProposal:
-    """A density fitted to draws of a posterior, with a share of another, if there is one.
-
-    quantiles: (P, K), at `SCORES`. copula: the mixture of normal scores.
-    """
+    """A density fitted to draws of a posterior, by quantiles (P, K) at `SCORES` and a mixture of normal scores, with a
+    share of another, if there is one."""
 
     quantiles: Floats
     copula: Mixture

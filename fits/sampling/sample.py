@@ -1,7 +1,4 @@
-"""Sampling the posterior about a fit, until the chain is long enough to be believed.
-
-Chains move in unconstrained coordinates, where the box has no walls; everything that is reported is physical.
-"""
+"""Sampling the posterior about a fit, in unconstrained coordinates, until the chain is long enough to be believed."""
 
 import time
 from dataclasses import asdict, replace
