@@ -8,7 +8,6 @@ import math
 from collections.abc import Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any, NamedTuple, cast
 
 import jax
@@ -165,10 +164,8 @@ def _with_discrepancy(
 ) -> Fit:
     """The fit with model discrepancy of these data sets: from the minima of that without, and a few other points."""
     sets = {name: problem.problems[name] for name in before}
-    whole = problem.with_problems(
-        {name: replace(one, noise=replace(one.noise, discrepancy=True)) for name, one in sets.items()}
-    )
-    points = []
+    sets = {name: replace(one, noise=replace(one.noise, discrepancy=True)) for name, one in sets.items()}
+    whole, points = problem.with_problems(sets), []
     for minimum in independent.minima[:MOST_STARTS]:
         values = dict(zip(whole.names, whole.start, strict=True)) | minimum.values
         points.append(unit_of(whole, np.array([values[name] for name in whole.names])))
@@ -183,10 +180,7 @@ def _with_discrepancy(
 
 
 def _fit_from(
-    problem: FittingProblem,
-    points: Floats,
-    run: _Run,
-    without: Mapping[str, WithoutDiscrepancy] = MappingProxyType({}),
+    problem: FittingProblem, points: Floats, run: _Run, without: Mapping[str, WithoutDiscrepancy] | None = None
 ) -> Fit:
     """The fit from these points (starts, P) of the unit box, in four steps."""
     # 1. all starts, at a coarse resolution where that is open
@@ -203,7 +197,7 @@ def _fit_from(
     if not run.screen:
         at, accuracy = refined(at, choices, run.options, run.progress)
     # 4. what follows from it
-    return _result(at, accuracy, run, without)
+    return _result(at, accuracy, run, without or {})
 
 
 def _result(at: Optimum, accuracy: Accuracy | None, run: _Run, without: Mapping[str, WithoutDiscrepancy]) -> Fit:

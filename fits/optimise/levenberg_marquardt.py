@@ -233,6 +233,7 @@ def descend(model: Model, start: Array, fresh: Array, most_steps: Array, toleran
     `tolerance` in the log-posterior. Not `fresh`: near a minimum, all levels free."""
     likelihood = model.objective == "likelihood"
     varying = likelihood and bool(model.logarithmic)
+    enough, logarithmic = tolerance if likelihood else None, model.logarithmic if varying else ()
     damping = jnp.where(fresh, FIRST_DAMPING, NEARBY)
 
     def stage(unit: Array, held: tuple[Array, Array, Array]) -> tuple[Array, Descent]:
@@ -242,22 +243,13 @@ def descend(model: Model, start: Array, fresh: Array, most_steps: Array, toleran
             return model.linear_parts(model.box.from_unit(unit), (sigma, share) if varying else None)
 
         def onward(state: State) -> State:
-            return step(
-                residuals,
-                state,
-                tolerance if likelihood else None,
-                model.logarithmic if varying else (),
-                watch=lambda auxiliary: auxiliary[1],
-            )
+            return step(residuals, state, enough, logarithmic, watch=lambda auxiliary: auxiliary[1])
 
         shapes = jax.eval_shape(residuals, unit)[1]
         auxiliary = jax.tree.map(lambda one: jnp.zeros(one.shape, one.dtype), shapes)
         watched = jnp.zeros((unit.size, *auxiliary[1].shape), auxiliary[1].dtype)
-        end = jax.lax.while_loop(
-            lambda state: ~state.ended & (state.steps < most),
-            onward,
-            first_state(unit, damping, auxiliary, watched),
-        )
+        begin = first_state(unit, damping, auxiliary, watched)
+        end = jax.lax.while_loop(lambda state: ~state.ended & (state.steps < most), onward, begin)
         found = Descent(
             vector=model.box.from_unit(end.point),
             cost=end.cost,
@@ -273,14 +265,9 @@ def descend(model: Model, start: Array, fresh: Array, most_steps: Array, toleran
 
     sigmas, most, shared = jnp.full((1, 1, 1), jnp.nan), most_steps[None], jnp.ones(1)
     if varying:  # far from the data, a level grows until everything fits: go near it first, with sigma held
-        sigmas, most, shared = (
-            jnp.stack([sigmas[0]] * 2),
-            jnp.stack([jnp.where(fresh, most_steps, 0), most_steps]),
-            jnp.arange(2.0),
-        )
-    if likelihood and model.varying:
-        held = model.initial_sigma(model.box.from_unit(start))
+        held = model.initial_sigma(model.box.from_unit(start)) if model.varying else sigmas[0]
         sigmas = jnp.stack([held, jnp.full_like(held, jnp.nan)])
+        most, shared = jnp.stack([jnp.where(fresh, most_steps, 0), most_steps]), jnp.arange(2.0)
     _, stages = jax.lax.scan(stage, start, (sigmas, shared, most))
     last = jax.tree.map(lambda part: part[-1], stages)
     finite = jnp.isfinite(last.cost)

@@ -69,12 +69,9 @@ class Resolutions:
         """The transport at the next finer resolution; None beyond the finest that is chosen."""
         finer = self.as_stated(transport.finer())
         if self.open and not self.tilted:  # what is as fine as it gets stays, the other is refined
-            nodes, modes = transport.nodes or 0, transport.modes or 0
-            finer = replace(
-                transport,
-                nodes=max(nodes, min(finer.nodes or 0, FINEST_NODES)),
-                modes=max(modes, min(finer.modes or 0, FINEST_MODES)),
-            )
+            nodes = max(transport.nodes or 0, min(finer.nodes or 0, FINEST_NODES))
+            modes = max(transport.modes or 0, min(finer.modes or 0, FINEST_MODES))
+            finer = replace(transport, nodes=nodes, modes=modes)
         elif ((finer.ordinates or (0, 0))[0] > FINEST_COSINES) if self.tilted else (finer.nodes or 0) > FINEST_NODES:
             return None
         return None if finer == transport else finer

@@ -111,16 +111,13 @@ def uncertainty(problem: FittingProblem, vector: Floats, cost: float) -> Uncerta
         spread = np.sqrt(np.diagonal(boxes))
         errors[free] = np.where(spread > UNKNOWN_BEYOND, np.inf, spread * width[free])
         covariance[np.ix_(free, free)] = boxes * np.outer(width[free], width[free])
-    return Uncertainty(
-        at_bound, errors, covariance, condition_number(data_root), unidentified, insensitive, found.predicted
-    )
+    condition = condition_number(data_root)
+    return Uncertainty(at_bound, errors, covariance, condition, unidentified, insensitive, found.predicted)
 
 
 def local_information(problem: FittingProblem, unit: Floats) -> tuple[Floats, Floats, float]:
-    """Rows of A, of the data and the prior, (rows, P), anywhere in the unit box: A'A is the information in boxes^-2.
-
-    And the gradient of the negative log-posterior there, (P,), in boxes^-1, and this itself up to a constant.
-    """
+    """Rows of A, of the data and the prior, (rows, P), anywhere in the unit box: A'A is the information in boxes^-2;
+    the gradient of the negative log-posterior there, (P,), in boxes^-1; and this itself up to a constant."""
     found = evaluate_at(problem, unit)
     rows = np.vstack([found.root, np.asarray(problem.model.box.prior_slopes(), float)])
     return rows, found.gradient, float(found.cost)

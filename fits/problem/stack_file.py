@@ -127,7 +127,7 @@ def write_problem(
     """Write a TOML file that `read_problem` reads back to the same. What the call omits is omitted there.
 
     Args:
-        path: of the file.
+        path: the file.
         stack: may hold `Free`.
         transport, noise, scale, objective, instrument: see `Problem`.
         force: replace a file that is there.
