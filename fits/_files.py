@@ -55,11 +55,9 @@ def write_text(path: str | Path, text: str, force: bool = False) -> None:
     write_bytes(path, text.encode(), force)
 
 
-def write_bytes(path: str | Path, content: bytes, force: bool = False, durable: bool = False) -> None:
-    """Write a file atomically, by a temporary one beside it; an existing file is a ValueError unless `force`.
-
-    durable: the content has reached the disk before it replaces an existing file. An OSError names the file.
-    """
+def write_bytes(path: str | Path, content: bytes, force: bool = False) -> None:
+    """Write a file atomically, by a temporary one beside it; an existing file is a ValueError unless `force`. An
+    OSError names the file."""
     path = given_path("path", path)
     require_switch("force", force)
     if path.exists() and not force:
@@ -71,9 +69,6 @@ def write_bytes(path: str | Path, content: bytes, force: bool = False, durable: 
         try:
             with os.fdopen(descriptor, "wb") as file:
                 file.write(content)
-                if durable:
-                    file.flush()
-                    os.fsync(file.fileno())
             os.chmod(temporary, permissions(0o666))  # mkstemp makes files that only their owner can read
             os.replace(temporary, path)
         except BaseException:
@@ -164,17 +159,18 @@ def named(path: Path) -> Iterator[None]:
 
 @contextmanager
 def locked(path: Path, what: str) -> Iterator[None]:
-    """Hold a lock file for the block; it is released when the process ends, in whatever way.
-
-    Raises ValueError, with the number of the process that holds the lock, if another one does.
-    """
+    """Hold a lock file for the block; it is released when the process ends, in whatever way. ValueError, with the
+    number of the process that holds the lock, if another one does."""
     import filelock
 
     lock = filelock.FileLock(path)
     try:
         lock.acquire(blocking=False)
     except filelock.Timeout:
-        raise ValueError(f"{what} is in use by another process ({_holder(path)}): one at a time may write it") from None
+        holder = "unknown"
+        with suppress(OSError):
+            holder = path.read_text().strip() or holder
+        raise ValueError(f"{what} is in use by another process ({holder}): one at a time may write it") from None
     try:
         with suppress(OSError):  # on a full disk the lock holds without a number in it
             path.write_text(f"{os.getpid()}\n")
@@ -183,13 +179,6 @@ def locked(path: Path, what: str) -> Iterator[None]:
         with suppress(OSError):  # Windows does not delete open files
             path.unlink()  # while it is held: a process that opened it before sees that it is deleted
         lock.release()
-
-
-def _holder(path: Path) -> str:
-    try:
-        return path.read_text().strip() or "unknown"
-    except OSError:
-        return "unknown"
 
 
 def permissions(mode: int) -> int:

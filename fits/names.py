@@ -27,5 +27,4 @@ To = Literal["rgl", "merl", "zemax", "klems", "openpbr", "csv"]
 FORMATS: tuple[Format, ...] = get_args(Format)
 QUANTITIES: tuple[Quantity, ...] = get_args(Quantity)
 STRATA: tuple[Strata, ...] = get_args(Strata)
-OBJECTIVES: tuple[Objective, ...] = get_args(Objective)
 EXPORTS: tuple[To, ...] = get_args(To)

@@ -59,8 +59,8 @@ class _Pace:
 class _Lines:
     """At most one line per `SECONDS_BETWEEN_LINES`, plus one when a stage begins and one when it is complete."""
 
-    def __init__(self, stream: TextIO, name: str):
-        self.stream, self.name = stream, name
+    def __init__(self, stream: TextIO):
+        self.stream = stream
         self.stage, self.written, self.pace = "", 0.0, _Pace()
 
     def __call__(self, stage: str, done: int, total: int | None = None, info: str = "") -> None:
@@ -70,15 +70,15 @@ class _Lines:
             return
         self.stage, self.written = stage, now
         count = f"{done}/{total}" if total is not None else str(done)
-        print(f"{self.name}: {stage} {count}{f' ({info})' if info else ''}", file=self.stream, flush=True)
+        print(f"layerjax: {stage} {count}{f' ({info})' if info else ''}", file=self.stream, flush=True)
 
 
 @contextmanager
-def show_progress(stream: TextIO | None = None, name: str = "layerjax") -> Iterator[Progress]:
+def show_progress(stream: TextIO | None = None) -> Iterator[Progress]:
     """Yield the callback for `progress=`; the bar is drawn on `stream` (stderr) and removed when the block ends."""
     stream = sys.stderr if stream is None else stream
     if not stream.isatty():
-        yield _Lines(stream, name)
+        yield _Lines(stream)
         return
 
     from rich.console import Console

@@ -15,12 +15,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
 from jax import Array
 from jax.flatten_util import ravel_pytree
 from numpy.typing import NDArray
 
-from fits.optimise.levenberg_marquardt import COST_TOLERANCE, FIRST_DAMPING, NEARBY, BoxLevenbergMarquardt
+from fits.optimise.levenberg_marquardt import COST_TOLERANCE, FIRST_DAMPING, NEARBY, State, first_state
+from fits.optimise.levenberg_marquardt import step as step_of
 from fits.optimise.multi_start import MOST_STEPS
 from fits.optimise.uncertainty import LARGEST_ERROR, LEAST_GRADIENT, ON_BOUND, UNIDENTIFIED_BEYOND, UNKNOWN_BEYOND
 from fits.problem.model import Model
@@ -41,8 +41,6 @@ LAST = 0.01
 
 KNOWN = 64
 """Starts whose linearisation a program takes, or a multiple of that, so that there are few programs."""
-
-_SOLVER = BoxLevenbergMarquardt()
 
 
 # ---- measurements of texels ----
@@ -292,13 +290,12 @@ class _Run(NamedTuple):
     """A texel on its way.
 
     rough: whether it goes by `sigma`, (N, C), which is held, as far from the data where levels of noise are free.
-    unit: (P,), and the solver's state, whose auxiliary output is the linearisation at `unit`. stopped, converged: bool.
+    state: of the optimiser, whose auxiliary output is the linearisation at its point. stopped, converged: bool.
     """
 
     rough: Any
     sigma: Any
-    unit: Any
-    state: Any
+    state: State
     stopped: Any
     converged: Any
 
@@ -405,71 +402,55 @@ def _linearise(model: Model, vector: Array) -> Linearisation:
     return Linearisation(values, jnp.concatenate([slopes, rest]))
 
 
-def _options(model: Model, fresh: Array, most_steps: Array) -> dict[str, Any]:
-    """The options of the solver."""
-    options: dict[str, Any] = {"damping": jnp.where(fresh, FIRST_DAMPING, NEARBY), "most_steps": most_steps}
-    if model.objective == "likelihood":
-        options |= {"tolerance": COST_TOLERANCE} | ({"logarithmic": model.logarithmic} if model.varying else {})
-    return options
-
-
 def _begin(model: Model, fresh: Array, start: tuple[Array, Texels]) -> _Run:
     """A texel at its start (P,), before the first step."""
     unit, own = start[0], model_of(model, start[1])
     levels = model.objective == "likelihood" and model.varying
     nothing = jnp.zeros((unit.size, *own.values.shape), unit.dtype)
-    state = _initial(model, fresh, unit, Linearisation(nothing[0], nothing))
+    state = first_state(unit, jnp.where(fresh, FIRST_DAMPING, NEARBY), Linearisation(nothing[0], nothing))
     sigma, no = own.initial_sigma(model.box.from_unit(unit)) if levels else jnp.zeros(0), jnp.asarray(False)
-    return _Run(fresh & levels, sigma, unit, state, no, no)
-
-
-def _initial(model: Model, fresh: Array, unit: Array, known: Linearisation) -> Any:
-    state = _SOLVER.init(None, unit, None, _options(model, fresh, jnp.asarray(0)), None, known, frozenset())
-    return _with_auxiliary(state, known)
-
-
-def _with_auxiliary(state: Any, auxiliary: Linearisation) -> Any:
-    return eqx.tree_at(lambda s: s.auxiliary, state, auxiliary, is_leaf=lambda part: part is None)
+    return _Run(fresh & levels, sigma, state, no, no)
 
 
 def _step(model: Model, fresh: Array, most_steps: Array, run: _Run, row: Texels, trial: Linearisation) -> _Run:
     """A texel after a step by what is known of its trial."""
     own = _linear(model_of(model, row), trial, model.box.from_unit(run.state.trial))
-    options = _options(model, fresh, most_steps)
-    levels = model.objective == "likelihood" and model.varying
+    likelihood = model.objective == "likelihood"
+    levels = likelihood and model.varying
     first_step = (jnp.where(run.rough, run.sigma, jnp.nan), jnp.ones(())) if levels else None
 
-    def residuals(unit: Array, _: None) -> tuple[Any, Linearisation]:
+    def residuals(unit: Array) -> tuple[Any, Linearisation]:
         return own.linear_parts(model.box.from_unit(unit), first_step)[0], trial
 
     first = run.state.steps == 0
-    unit, state, _ = _SOLVER.step(residuals, run.unit, None, options, run.state, frozenset())
-    state = _with_auxiliary(state, jax.tree.map(partial(jnp.where, first), trial, state.auxiliary))
-    stop, result = _SOLVER.terminate(residuals, unit, None, options, state, frozenset())
+    tolerance, logarithmic = COST_TOLERANCE if likelihood else None, model.logarithmic if levels else ()
+    state = step_of(residuals, run.state, tolerance, logarithmic)
+    state = replace(state, auxiliary=jax.tree.map(partial(jnp.where, first), trial, state.auxiliary))
+    stop = state.ended | (state.steps >= most_steps)
+    converged = ~state.failed & (state.ended | ~stop)  # it may still end below
 
     # the next step is the last if it is a full one, and the decrease of another is too small where decreases go on to
     # shrink as they did (after Hairer and Wanner 1996, IV.8): all is linear on such a short way
     followed = state.full_decrease**2 <= LAST * COST_TOLERANCE * run.state.full_decrease
     full = state.full_decrease - state.predicted <= LAST * COST_TOLERANCE
     last = ~stop & ~run.rough & followed & full & jnp.isfinite(run.state.full_decrease)
-    last &= model.objective == "likelihood"
-    moved = model.box.from_unit(state.trial) - model.box.from_unit(unit)
+    last &= likelihood
+    moved = model.box.from_unit(state.trial) - model.box.from_unit(state.point)
     near = state.auxiliary._replace(values=state.auxiliary.values + jnp.tensordot(moved, state.auxiliary.slopes, 1))
-    gradient = state.gradient + state.normal @ (state.trial - unit)
-    after = _with_auxiliary(replace(state, cost=state.cost - state.predicted, gradient=gradient), near)
-    unit, state = jax.tree.map(partial(jnp.where, last), (state.trial, after), (unit, state))
+    gradient, cost = state.gradient + state.normal @ (state.trial - state.point), state.cost - state.predicted
+    after = replace(state, point=state.trial, cost=cost, gradient=gradient, auxiliary=near)
+    state = jax.tree.map(partial(jnp.where, last), after, state)
     stop |= last
 
     if levels:  # near the data with sigma held: the same again with the levels of noise free
-        begun = _initial(model, fresh, unit, state.auxiliary)
+        begun = first_state(state.point, jnp.where(fresh, FIRST_DAMPING, NEARBY), state.auxiliary)
         state = jax.tree.map(partial(jnp.where, stop & run.rough), begun, state)
-    converged = (result == optx.RESULTS.successful) & jnp.isfinite(state.cost)
-    return _Run(run.rough & ~stop, run.sigma, unit, state, stop & ~run.rough, converged)
+    return _Run(run.rough & ~stop, run.sigma, state, stop & ~run.rough, converged & jnp.isfinite(state.cost))
 
 
 def _results(model: Model, run: _Run, row: Texels) -> Fits:
     """What is known where a texel ended."""
-    own, unit, cost = model_of(model, row), run.unit, run.state.cost
+    own, unit, cost = model_of(model, row), run.state.point, run.state.cost
     vector, predicted, finite = model.box.from_unit(unit), run.state.auxiliary.values, jnp.isfinite(cost)
     near = _linear(own, run.state.auxiliary, vector)
     rows = jax.jacfwd(lambda unit: near.linear_parts(model.box.from_unit(unit))[1][1])(unit)

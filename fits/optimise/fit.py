@@ -1,22 +1,21 @@
-"""A fit in four steps: multi-start, polish with uncertainties, resolution, result; and again with model discrepancy.
+"""A fit in four steps: multi-start, polish with uncertainties, resolution, result.
 
-Where nothing is said of a discrepancy, the rule is: the stack is fitted with independent noise; where residuals of
-neighbours along the scans are correlated by more than `FitOptions` allow, it is fitted again with a discrepancy.
+Where nothing is said of a discrepancy, the stack is fitted with independent noise; where residuals of neighbours along
+the scans are correlated by more than `FitOptions` allow, it is fitted again with a discrepancy.
 """
 
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from numpy.typing import NDArray
 
 from fits._files import given_path, require_switch
+from fits.data.geometry import Floats
 from fits.data.measurements import Measurements
 from fits.data.scans import correlation, neighbours
 from fits.data.totals import Totals
@@ -33,15 +32,7 @@ from fits.optimise.multi_start import (
     unit_of,
 )
 from fits.optimise.options import DEFAULT, FitOptions
-from fits.optimise.resolution import (
-    FAR_RINGS,
-    Accuracy,
-    has_rays,
-    leaves_rays_open,
-    refined,
-    resolutions,
-    rings_of_lobes,
-)
+from fits.optimise.resolution import Accuracy, for_starts, refined
 from fits.optimise.result import OUTCOMES, Fit, Minimum, WithoutDiscrepancy
 from fits.optimise.uncertainty import UNCONSTRAINED_BEYOND
 from fits.problem.instrument import Instrument
@@ -53,13 +44,8 @@ from fits.progress import Progress, given_progress, silent
 from layerjax._checks import require_count, require_kind, require_seed
 from layerjax.compiling import programs_kept
 
-Floats = NDArray[np.float64]
-
-SAME_AT_MOST = 0.05
-"""Share of its box up to which a standard error counts where minima are compared."""
-
-MOST_STARTS = 8
-"""Minima without model discrepancy that the fit with it starts from; of its other starts half as many."""
+SAME_AT_MOST = 0.05  # share of its box up to which a standard error counts where minima are compared
+MOST_STARTS = 8  # minima without model discrepancy that the fit with it starts from; of other starts half as many
 
 
 @programs_kept()
@@ -94,8 +80,8 @@ def fit(
         options: tolerances and thresholds.
         progress: called with ("fit", starts done, starts, note).
         checkpoint: a file that each start is kept in as it ends: a fit that was killed takes those that are there for
-            done. It stays, as does one beside it for what is fitted again with model discrepancy; one of another
-            problem is replaced.
+            done. It stays, as does one beside it for a second fit with model discrepancy; one of another problem is
+            replaced.
         screen: stay at the resolution of the starts, do not estimate its error, continue only the starts that are
             lowest after a few steps, and stop near the minimum: enough to rank stacks.
 
@@ -103,23 +89,16 @@ def fit(
         ValueError: as `Problem`; starts < 1.
     """
     if isinstance(stack, FittingProblem):
+        problem = stack
         arguments: dict[str, Any] = {"data": data, "noise": noise, "scale": scale, "instrument": instrument}
         arguments |= {"transport": None if transport == "auto" else transport}
         arguments |= {"objective": None if objective == "likelihood" else objective}
         for name, given in arguments.items():
             if given is not None:
                 raise ValueError(f"{name} is given beside a {type(stack).__name__}, which says it all")
-        problem = stack
     else:
-        problem = Problem(
-            stack,
-            cast(Measurements, data),
-            transport,
-            Noise() if noise is None else noise,
-            scale,
-            objective,
-            instrument,
-        )
+        noise = Noise() if noise is None else noise
+        problem = Problem(stack, cast(Measurements, data), transport, noise, scale, objective, instrument)
     require_count("starts", starts, 1)
     require_seed(seed)
     require_switch("screen", screen)
@@ -127,11 +106,7 @@ def fit(
     require_kind("options", options, FitOptions)
     run = _Run(starts, seed, options, given_progress(progress), checkpoint, screen)
     independent = _fit_from(problem, start_points(problem, starts, seed), run)
-    before = {
-        name: found
-        for name, one in problem.problems.items()
-        if undecided(one) and needs_discrepancy(found := without_discrepancy(independent.part(name)), options)
-    }
+    before = {name: found for name in problem.problems if (found := _refuted(independent.part(name), options))}
     return _with_discrepancy(problem, independent, before, run) if before else independent
 
 
@@ -158,14 +133,6 @@ class _Run(NamedTuple):
     screen: bool = False
 
 
-def undecided(problem: Problem) -> bool:
-    """Whether it is left to the residuals, and could be counted."""
-    noise = problem.noise
-    if isinstance(problem.data, Totals):
-        return False  # they have no neighbours
-    return noise.discrepancy is None and noise.tails == "gaussian" and problem.objective == "likelihood"
-
-
 def without_discrepancy(fit: Fit) -> WithoutDiscrepancy:
     """What is to be said of a fit without model discrepancy."""
     pairs = neighbours(fit.problem.data.used(), fit.residuals)
@@ -180,25 +147,25 @@ def without_discrepancy(fit: Fit) -> WithoutDiscrepancy:
     )
 
 
-def needs_discrepancy(independent: WithoutDiscrepancy, options: FitOptions = DEFAULT) -> bool:
-    """Whether residuals of neighbours are correlated, by the rule above."""
-    correlation = independent.residual_autocorrelation
-    clear = correlation * math.sqrt(independent.pairs) > options.autocorrelation_errors
-    return clear and correlation > options.autocorrelation
+def _refuted(independent: Fit, options: FitOptions) -> WithoutDiscrepancy | None:
+    """What is to be said of a fit whose residuals are correlated, where it is left to these; else None."""
+    problem = independent.problem
+    possible = problem.noise.tails == "gaussian" and independent.is_posterior and not isinstance(problem.data, Totals)
+    if problem.noise.discrepancy is not None or not possible:
+        return None
+    found = without_discrepancy(independent)
+    errors = found.residual_autocorrelation * math.sqrt(found.pairs)
+    clear = errors > options.autocorrelation_errors and found.residual_autocorrelation > options.autocorrelation
+    return found if clear else None
 
 
 def _with_discrepancy(
     problem: FittingProblem, independent: Fit, before: Mapping[str, WithoutDiscrepancy], run: _Run
 ) -> Fit:
-    """The fit with model discrepancy of these data sets, which were fitted with independent noise before.
-
-    It starts from the minima of that fit, and from some of as many points as that had.
-    """
-    changed = {name: problem.problems[name] for name in before}
-    whole = problem.with_problems(
-        {name: replace(one, noise=replace(one.noise, discrepancy=True)) for name, one in changed.items()}
-    )
-    points = []
+    """The fit with model discrepancy of these data sets: from the minima of that without, and a few other points."""
+    sets = {name: problem.problems[name] for name in before}
+    sets = {name: replace(one, noise=replace(one.noise, discrepancy=True)) for name, one in sets.items()}
+    whole, points = problem.with_problems(sets), []
     for minimum in independent.minima[:MOST_STARTS]:
         values = dict(zip(whole.names, whole.start, strict=True)) | minimum.values
         points.append(unit_of(whole, np.array([values[name] for name in whole.names])))
@@ -213,38 +180,24 @@ def _with_discrepancy(
 
 
 def _fit_from(
-    problem: FittingProblem,
-    points: Floats,
-    run: _Run,
-    without: Mapping[str, WithoutDiscrepancy] = MappingProxyType({}),
+    problem: FittingProblem, points: Floats, run: _Run, without: Mapping[str, WithoutDiscrepancy] | None = None
 ) -> Fit:
     """The fit from these points (starts, P) of the unit box, in four steps."""
     # 1. all starts, at a coarse resolution where that is open
-    known = {name: found for name, one in problem.problems.items() if (found := resolutions(one)) is not None}
-    open_rays = {name for name, one in problem.problems.items() if leaves_rays_open(one)}
-    coarse = {name: replace(problem.problems[name], transport=one.far) for name, one in known.items() if one.open}
-    problem = problem.with_problems(coarse)
-    for name in open_rays:
-        one = problem.problems[name]
-        rings = min(rings_of_lobes(one, one.start), FAR_RINGS)
-        problem = problem.with_problems(
-            {name: replace(one, instrument=replace(cast(Any, one.instrument), rings=rings))}
-        )
+    problem, choices = for_starts(problem)
     if run.screen:
         ends = screened_starts(problem, points)
-    elif run.checkpoint is None:
-        ends = multi_start(problem, points, run.progress)
-    else:  # each is kept as it ends
-        with starts_store(run.checkpoint, problem, points) as store:
+    else:
+        with starts_store(run.checkpoint, problem, points) as store:  # each is kept as it ends
             ends = multi_start(problem, points, run.progress, store)
     # 2. the lowest of them, to its very minimum, with the uncertainties there
     at = polish(problem, ends, tolerance=ROUGH_TOLERANCE if run.screen else COST_TOLERANCE)
     # 3. at the resolution that the noise of the data asks for
     accuracy = None
-    if not run.screen and (known or any(map(has_rays, problem.problems.values()))):
-        at, accuracy = refined(at, known, open_rays, run.options, run.progress)
+    if not run.screen:
+        at, accuracy = refined(at, choices, run.options, run.progress)
     # 4. what follows from it
-    return _result(at, accuracy, run, without)
+    return _result(at, accuracy, run, without or {})
 
 
 def _result(at: Optimum, accuracy: Accuracy | None, run: _Run, without: Mapping[str, WithoutDiscrepancy]) -> Fit:
@@ -318,8 +271,7 @@ def _minima(problem: FittingProblem, at: Optimum, options: FitOptions) -> tuple[
         equal_cost = abs(cost[index] - cost[other]) <= options.same_cost * at.excess
         return bool(np.all(np.abs(units[index] - units[other]) <= (same_at_equal_cost if equal_cost else same)))
 
-    leaders: list[int] = []
-    counts: list[int] = []
+    leaders, counts = list[int](), list[int]()
     outcomes = dict.fromkeys(OUTCOMES, 0)
     for index in sorted(range(len(ends)), key=lambda k: (cost[k], k != best)):
         if not np.isfinite(cost[index]) and index != best:

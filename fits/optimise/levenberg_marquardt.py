@@ -21,23 +21,16 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 from jax import Array
-from numpy.typing import NDArray
 
+from fits.data.geometry import Floats
 from fits.problem.model import Model
 from fits.problem.problem import FittingProblem
 
-Floats = NDArray[np.float64]
+COST_TOLERANCE = 1e-8  # converged: a full step would gain less in the log-posterior, 1e-4 standard errors
+RELATIVE_TOLERANCE = 1e-10  # or without a likelihood less than this share of the cost
+ROUGH_TOLERANCE = 1e-4  # a hundredth of a standard error: distinguishes minima, after about a third of the steps
 
-COST_TOLERANCE = 1e-8
-"""A likelihood fit has converged when a full step is predicted to gain less than this in the log-posterior: 1e-4
-standard errors."""
-
-NEARBY = 1e-4
-"""Damping near a minimum: a step is all but a full one."""
-
-ROUGH_TOLERANCE = 1e-4
-"""A hundredth of a standard error: distinguishes minima, after about a third of the steps where these gain least."""
-
+NEARBY = 1e-4  # damping near a minimum: a step is all but a full one
 FIRST_DAMPING = 1e-2
 FIRST_GROWTH = 4.0
 SMALLEST_DAMPING = 128.0  # units of rounding: keeps a singular matrix positive definite
@@ -47,8 +40,18 @@ SHORTEST = 1e-7  # column of the Jacobian, of the longest one: shorter ones are 
 PASSES = 3
 
 
-class _State(eqx.Module):
+class State(eqx.Module):
+    """Where a descent in the unit box [0, 1]^P has come to after `steps` trials.
+
+    point: (P,), the best so far, with what is known there: cost, gradient (P,) and normal matrix (P, P), the auxiliary
+    output of the residuals, and the Jacobian of what is watched of it, a leading axis for the parameters.
+    trial: (P,), what is tried next, to gain `predicted` in the cost; full_decrease: more cannot be gained.
+    ended: nothing is left to gain, or no step gains anything; failed: no step does though something is left, or the
+    start has residuals that are not finite.
+    """
+
     steps: Array
+    point: Array
     trial: Array
     cost: Array
     gradient: Array
@@ -59,127 +62,143 @@ class _State(eqx.Module):
     growth: Array
     auxiliary: Any
     watched: Any
-    terminate: Array
+    ended: Array
     failed: Array
 
 
+def first_state(point: Array, damping: Array, auxiliary: Any, watched: Any = None) -> State:
+    """Before the first trial, which is the point itself; auxiliary, watched: of the shapes that they will have."""
+    zero, no = jnp.zeros((), point.dtype), jnp.array(False)
+    return State(
+        steps=jnp.zeros((), int),
+        point=point,
+        trial=point,
+        cost=zero + jnp.inf,
+        gradient=jnp.zeros_like(point),
+        normal=jnp.eye(point.size, dtype=point.dtype),
+        predicted=zero,
+        full_decrease=zero + jnp.inf,
+        damping=zero + damping,
+        growth=zero + FIRST_GROWTH,
+        auxiliary=auxiliary,
+        watched=watched,
+        ended=no,
+        failed=no,
+    )
+
+
+def step(
+    residuals: Callable[[Array], tuple[Any, Any]],
+    state: State,
+    tolerance: Array | float | None = None,
+    logarithmic: tuple[int, ...] = (),
+    watch: Callable[[Any], Any] = lambda auxiliary: None,
+) -> State:
+    """Evaluate the trial, accept or refuse it, and propose the next one.
+
+    residuals: of a point, a tree of arrays, half whose sum of squares is the cost; and an auxiliary output.
+    tolerance: it ends when a full Gauss-Newton step is predicted to gain less; None: `RELATIVE_TOLERANCE` of the cost.
+    logarithmic: places among the leaves of the residuals of those that have logarithms L of noise levels as half their
+        squares: dL'dL takes the place of their J'J, which makes the sum the Fisher information (J'J alone would
+        overshoot up to twofold at every step).
+    watch: picks the part of the auxiliary output whose Jacobian is kept.
+    """
+    first = state.steps == 0
+    at_trial = _normal_equations(residuals, state.trial, logarithmic, watch)
+    cost, gradient, normal = at_trial[:3]
+    finite = jnp.isfinite(cost) & jnp.all(jnp.isfinite(gradient)) & jnp.all(jnp.isfinite(normal))
+    ratio = (state.cost - cost) / jnp.where(state.predicted > 0, state.predicted, 1.0)
+    accept = finite & (first | (ratio > SMALLEST_RATIO))
+
+    shrink = jnp.maximum(1.0 / 9.0, 1.0 - (2.0 * jnp.clip(ratio, 0.0, 1.0) - 1.0) ** 3)
+    next_damping = jnp.where(accept, state.damping * shrink, state.damping * state.growth)
+    epsilon = jnp.finfo(cost.dtype).eps
+    least = jnp.asarray(SMALLEST_DAMPING * epsilon, cost.dtype)
+    damping = jnp.maximum(jnp.where(first, state.damping, next_damping), least)
+
+    before = state.point, state.cost, state.gradient, state.normal, state.auxiliary, state.watched
+    point, cost, gradient, normal, auxiliary, watched = jax.tree.map(
+        lambda new, old: jnp.where(accept, new, old), (state.trial, *at_trial), before
+    )
+    trial, predicted, full_decrease = _projected_step(point, gradient, normal, damping, least)
+
+    enough = RELATIVE_TOLERANCE * cost if tolerance is None else tolerance
+    converged = full_decrease <= jnp.maximum(enough, 4 * epsilon * cost)
+    lost = ~accept & (predicted > 0) & (predicted <= 4 * epsilon * cost)  # too small a decrease to be seen
+    stalled = lost & (full_decrease > jnp.sqrt(epsilon) * cost)
+    hopeless = stalled | (damping > LARGEST_DAMPING) | (first & ~finite)
+    return State(
+        steps=state.steps + 1,
+        point=point,
+        trial=trial,
+        cost=cost,
+        gradient=gradient,
+        normal=normal,
+        predicted=predicted,
+        full_decrease=full_decrease,
+        damping=damping,
+        growth=jnp.where(accept, FIRST_GROWTH, 2.0 * state.growth),
+        auxiliary=auxiliary,
+        watched=watched,
+        ended=converged | lost | hopeless,
+        failed=hopeless & ~converged,
+    )
+
+
 class BoxLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
-    """Minimises half the sum of squared residuals over vectors in [0, 1]^P.
+    """`step` as a solver of optimistix, for vectors in the unit box.
 
-    The residuals are a tree of arrays. Those whose place among its leaves is in `options["logarithmic"]` have
-    logarithms L of noise levels as half their squares: dL'dL takes the place of their J'J, which makes the sum the
-    Fisher information (J'J alone would overshoot up to twofold at every step).
-
-    It stops when a full Gauss-Newton step is predicted to gain less than `options["tolerance"]` (default: `atol + rtol
-    cost`), when rounding ends all progress, or after `options["most_steps"]`; it begins with `options["damping"]`. All
-    of these may be traced. A start whose residuals are not finite, or a stall away from a minimum, gives
-    `optx.RESULTS.nonlinear_divergence`.
-
-    The solution has the auxiliary output at the solution, and statistics have the "cost" and its "gradient" there; as
-    "watched" the Jacobian, a leading axis for the P parameters, of the part of it that `options["watch"]` picks.
+    Its options are the arguments of `step`, "damping" at the start, and "most_steps". A start that is not finite, or a
+    stall away from a minimum, gives `optx.RESULTS.nonlinear_divergence`. Statistics have the last `State` as "state".
     """
 
-    rtol: float = 1e-10
+    rtol: float = RELATIVE_TOLERANCE
     atol: float = 0.0
     norm: Callable[[Any], Array] = optx.max_norm
 
-    def init(self, fn: Any, y: Array, args: Any, options: Any, f_struct: Any, aux_struct: Any, tags: Any) -> _State:
+    def init(self, fn: Any, y: Array, args: Any, options: Any, f_struct: Any, aux_struct: Any, tags: Any) -> State:
         """State before the first evaluation."""
-        zero = jnp.zeros((), y.dtype)
         auxiliary = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), aux_struct)
-        watched = jax.tree.map(lambda leaf: jnp.zeros((y.size, *leaf.shape), leaf.dtype), _watch(options)(aux_struct))
-        return _State(
-            steps=jnp.zeros((), int),
-            trial=y,
-            cost=zero + jnp.inf,
-            gradient=jnp.zeros_like(y),
-            normal=jnp.eye(y.size, dtype=y.dtype),
-            predicted=zero,
-            full_decrease=zero + jnp.inf,
-            damping=zero + options.get("damping", FIRST_DAMPING),
-            growth=zero + FIRST_GROWTH,
-            auxiliary=auxiliary,
-            watched=watched,
-            terminate=jnp.asarray(options.get("most_steps", 1)) < 1,
-            failed=jnp.array(False),
-        )
+        watched = _watch(options)(auxiliary)
+        watched = jax.tree.map(lambda leaf: jnp.zeros((y.size, *leaf.shape), leaf.dtype), watched)
+        return first_state(y, options.get("damping", FIRST_DAMPING), auxiliary, watched)
 
-    def step(self, fn: Any, y: Array, args: Any, options: Any, state: _State, tags: Any) -> tuple[Array, _State, Any]:
-        """Evaluate the trial, accept or refuse it, and propose the next one."""
-        first = state.steps == 0
-        cost, gradient, normal, auxiliary, watched = _normal_equations(fn, state.trial, args, options)
-        finite = jnp.isfinite(cost) & jnp.all(jnp.isfinite(gradient)) & jnp.all(jnp.isfinite(normal))
-        ratio = (state.cost - cost) / jnp.where(state.predicted > 0, state.predicted, 1.0)
-        accept = finite & (first | (ratio > SMALLEST_RATIO))
-
-        shrink = jnp.maximum(1.0 / 9.0, 1.0 - (2.0 * jnp.clip(ratio, 0.0, 1.0) - 1.0) ** 3)
-        step_damping = jnp.where(accept, state.damping * shrink, state.damping * state.growth)
-        epsilon = jnp.finfo(y.dtype).eps
-        least = jnp.asarray(SMALLEST_DAMPING * epsilon, y.dtype)
-        damping = jnp.maximum(jnp.where(first, state.damping, step_damping), least)
-        growth = jnp.where(accept, FIRST_GROWTH, 2.0 * state.growth)
-
-        y = jnp.where(accept, state.trial, y)
-        cost, gradient, normal = (
-            jnp.where(accept, new, old)
-            for new, old in ((cost, state.cost), (gradient, state.gradient), (normal, state.normal))
-        )
-        auxiliary, watched = jax.tree.map(
-            lambda new, old: jnp.where(accept, new, old), (auxiliary, watched), (state.auxiliary, state.watched)
-        )
-        trial, predicted, full_decrease = _projected_step(y, gradient, normal, damping, least)
-
-        enough = options.get("tolerance", self.atol + self.rtol * cost)
-        converged = full_decrease <= jnp.maximum(enough, 4 * epsilon * cost)
-        lost = ~accept & (predicted > 0) & (predicted <= 4 * epsilon * cost)  # too small a decrease to be seen
-        stalled = lost & (full_decrease > jnp.sqrt(epsilon) * cost)
-        hopeless = stalled | (damping > LARGEST_DAMPING) | (first & ~finite)
-        new_state = _State(
-            steps=state.steps + 1,
-            trial=trial,
-            cost=cost,
-            gradient=gradient,
-            normal=normal,
-            predicted=predicted,
-            full_decrease=full_decrease,
-            damping=damping,
-            growth=growth,
-            auxiliary=auxiliary,
-            watched=watched,
-            terminate=converged | lost | hopeless,
-            failed=hopeless & ~converged,
-        )
-        return y, new_state, auxiliary
+    def step(self, fn: Any, y: Array, args: Any, options: Any, state: State, tags: Any) -> tuple[Array, State, Any]:
+        """One evaluation, at the trial."""
+        tolerance, logarithmic = options.get("tolerance"), options.get("logarithmic", ())
+        state = step(lambda z: fn(z, args), state, tolerance, logarithmic, _watch(options))
+        return state.point, state, state.auxiliary
 
     def terminate(
-        self, fn: Any, y: Array, args: Any, options: Any, state: _State, tags: Any
+        self, fn: Any, y: Array, args: Any, options: Any, state: State, tags: Any
     ) -> tuple[Array, optx.RESULTS]:
         """Whether to stop, and why."""
-        out_of_steps = state.steps >= options.get("most_steps", jnp.inf)
-        short = optx.RESULTS.where(state.terminate, optx.RESULTS.successful, optx.RESULTS.nonlinear_max_steps_reached)
+        running = ~(state.ended | (state.steps >= options.get("most_steps", jnp.inf)))
+        short = optx.RESULTS.where(state.ended, optx.RESULTS.successful, optx.RESULTS.nonlinear_max_steps_reached)
         result = optx.RESULTS.where(state.failed, optx.RESULTS.nonlinear_divergence, short)
-        running = ~(state.terminate | out_of_steps)
         return ~running, optx.RESULTS.where(running, optx.RESULTS.successful, result)
 
     def postprocess(
-        self, fn: Any, y: Array, aux: Any, args: Any, options: Any, state: _State, tags: Any, result: Any
+        self, fn: Any, y: Array, aux: Any, args: Any, options: Any, state: State, tags: Any, result: Any
     ) -> tuple[Array, Any, dict[str, Any]]:
         """The solution, and what is known there."""
-        return y, state.auxiliary, {"cost": state.cost, "gradient": state.gradient, "watched": state.watched}
+        return y, state.auxiliary, {"state": state}
 
 
 def _watch(options: Any) -> Callable[[Any], Any]:
-    """What picks the part of the auxiliary output whose Jacobian is kept: nothing by default."""
     return options.get("watch", lambda auxiliary: None)
 
 
-def _normal_equations(fn: Any, y: Array, args: Any, options: Any) -> tuple[Array, Array, Array, Any, Any]:
-    """Cost, J'r and J'J at y, with J'J replaced for the `logarithmic` arrays of residuals; the auxiliary output, and
-    the Jacobian of what is watched of it."""
-    logarithmic, watch = options.get("logarithmic", ()), _watch(options)
+def _normal_equations(
+    residuals_of: Callable[[Array], tuple[Any, Any]],
+    y: Array,
+    logarithmic: tuple[int, ...],
+    watch: Callable[[Any], Any],
+) -> tuple[Array, Array, Array, Any, Any]:
+    """Cost, J'r and J'J at y, the auxiliary output, and the Jacobian of what is watched of it; see `step`."""
 
     def push(tangent: Array) -> tuple[Any, Any, Any, Any]:
-        (residuals, auxiliary), (tangents, moved) = jax.jvp(lambda z: fn(z, args), (y,), (tangent,))
+        (residuals, auxiliary), (tangents, moved) = jax.jvp(residuals_of, (y,), (tangent,))
         return residuals, auxiliary, tangents, watch(moved)
 
     residuals, auxiliary, columns, watched = jax.vmap(push, out_axes=(None, None, 0, 0))(jnp.eye(y.size, dtype=y.dtype))
@@ -197,11 +216,10 @@ def _normal_equations(fn: Any, y: Array, args: Any, options: Any) -> tuple[Array
 def _projected_step(
     y: Array, gradient: Array, normal: Array, damping: Array, least: Array
 ) -> tuple[Array, Array, Array]:
-    """The next trial in the box, the decrease that the quadratic model predicted decrease there, and the most it could
-    predicted decrease.
+    """The next trial in the box, the decrease that the quadratic model predicts there, and the most that can be gained.
 
-    The last belongs to the undamped step of all parameters that are not held, as if there were no box, but no more than
-    the slope gives on the way to the faces of the box: it bounds what is left to gain.
+    The last belongs to the undamped step of all parameters that are not held, as if there were no box, but is no more
+    than the slope gives on the way to the faces of the box.
     """
     length = jnp.sqrt(jnp.diagonal(normal))
     # a parameter of hardly any influence would take a step as wide as the box for next to no gain, however damped
@@ -239,12 +257,11 @@ def _damped_solve(matrix: Array, slope: Array, known: Array, fixed: Array, dampi
 
 
 class Descent(NamedTuple):
-    """Where a descent ended, and what is known there of a model with P parameters: arrays of JAX or of numpy.
+    """Where a descent ended, and what is known there of a model with P parameters: arrays of JAX, or numbers and numpy.
 
-    vector: physical, (P,). cost: infinite where the model has no finite value and Jacobian. steps: in all. converged,
-    max_steps_reached: whether it did, and whether it reached the maximum of steps. gradient: of the cost in the unit
-    box, (P,). root: (P, P), its root' root is the information in the data, in boxes^-2. predicted: (N, C), in 1/sr, NaN
-    with an infinite cost.
+    vector: physical, (P,). cost: infinite where the model has no finite value and Jacobian. steps: in all.
+    gradient: of the cost in the unit box, (P,). root: (P, P), its root' root is the information in the data, in
+    boxes^-2. predicted: (N, C), in 1/sr, NaN with an infinite cost. These are None of an end that was stored.
     """
 
     vector: Any
@@ -252,9 +269,9 @@ class Descent(NamedTuple):
     steps: Any
     converged: Any
     max_steps_reached: Any
-    gradient: Any
-    root: Any
-    predicted: Any
+    gradient: Any = None
+    root: Any = None
+    predicted: Any = None
 
 
 def descend(model: Model, start: Array, fresh: Array, most_steps: Array, tolerance: Array) -> Descent:
@@ -262,52 +279,47 @@ def descend(model: Model, start: Array, fresh: Array, most_steps: Array, toleran
     `tolerance` in the log-posterior. Not `fresh`: near a minimum, all levels free."""
     likelihood = model.objective == "likelihood"
     varying = likelihood and bool(model.logarithmic)
-    solver, damping = BoxLevenbergMarquardt(), jnp.where(fresh, FIRST_DAMPING, NEARBY)
-    options = {
+    options: dict[str, Any] = {
         "watch": lambda auxiliary: auxiliary[1],
-        "damping": damping,
-        **({"tolerance": tolerance} if likelihood else {}),
+        "damping": jnp.where(fresh, FIRST_DAMPING, NEARBY),
+        "tolerance": tolerance if likelihood else None,
+        "logarithmic": model.logarithmic if varying else (),
     }
-    options |= {"logarithmic": model.logarithmic} if varying else {}
 
     def residuals(unit: Array, first_step: tuple[Array, Array]) -> Any:
         return model.linear_parts(model.box.from_unit(unit), first_step if varying else None)
 
     def stage(unit: Array, held: tuple[Array, Array, Array]) -> tuple[Array, Descent]:
-        *first_step, most = held
+        sigma, share, most = held
         solution: Any = optx.least_squares(
             residuals,
-            solver,
+            BoxLevenbergMarquardt(),
             unit,
-            args=tuple(first_step),
+            args=(sigma, share),
             has_aux=True,
-            options={**options, "most_steps": most},
+            options=options | {"most_steps": most},
             max_steps=None,
             throw=False,
         )
+        end: State = solution.stats["state"]
         found = Descent(
-            vector=model.box.from_unit(solution.value),
-            cost=solution.stats["cost"],
-            steps=solution.stats["num_steps"],
-            converged=jnp.asarray(solution.result == optx.RESULTS.successful),
-            max_steps_reached=jnp.asarray(solution.result == optx.RESULTS.nonlinear_max_steps_reached),
-            gradient=solution.stats["gradient"],
+            vector=model.box.from_unit(end.point),
+            cost=end.cost,
+            steps=end.steps,
+            converged=end.ended & ~end.failed,
+            max_steps_reached=~end.ended,
+            gradient=end.gradient,
             # R of the QR decomposition has A's singular values without squaring its condition number
-            root=jnp.linalg.qr(solution.stats["watched"].T, mode="r"),
-            predicted=solution.aux[0],
+            root=jnp.linalg.qr(end.watched.T, mode="r"),
+            predicted=end.auxiliary[0],
         )
-        return solution.value, found
+        return end.point, found
 
     sigmas, most, shared = jnp.full((1, 1, 1), jnp.nan), most_steps[None], jnp.ones(1)
     if varying:  # far from the data, a level grows until everything fits: go near it first, with sigma held
-        sigmas, most, shared = (
-            jnp.stack([sigmas[0]] * 2),
-            jnp.stack([jnp.where(fresh, most_steps, 0), most_steps]),
-            jnp.arange(2.0),
-        )
-    if likelihood and model.varying:
-        held = model.initial_sigma(model.box.from_unit(start))
+        held = model.initial_sigma(model.box.from_unit(start)) if model.varying else sigmas[0]
         sigmas = jnp.stack([held, jnp.full_like(held, jnp.nan)])
+        most, shared = jnp.stack([jnp.where(fresh, most_steps, 0), most_steps]), jnp.arange(2.0)
     _, stages = jax.lax.scan(stage, start, (sigmas, shared, most))
     last = jax.tree.map(lambda part: part[-1], stages)
     finite = jnp.isfinite(last.cost)
@@ -325,7 +337,7 @@ def descent(
 ) -> Descent:
     """`descend`, compiled once for all problems of this structure; numbers in double precision."""
     found = problem.call(descend, start, np.asarray(fresh), np.asarray(most_steps), np.asarray(tolerance))
-    return Descent(*(np.asarray(part, float if jnp.issubdtype(part.dtype, jnp.floating) else None) for part in found))
+    return Descent(*(np.asarray(part, float) if part.ndim else part.item() for part in found))
 
 
 def evaluate_at(problem: FittingProblem, unit: Floats) -> Descent:

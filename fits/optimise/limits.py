@@ -10,14 +10,10 @@ from fits.data.scans import in_plane, scans, signed_angle
 from fits.optimise.result import Fit
 from layerjax.mixture import stacks_by_name
 
+# tangent of the half vector, over alpha, at which facets are half as many as along the normal
 HALF = {"ggx": math.sqrt(math.sqrt(2.0) - 1.0), "vmf": math.sqrt(math.log(2.0))}
-"""Tangent of the half vector, over alpha, at which facets are half as many as along the normal."""
-
-STEPS = 2.0
-"""That a lobe has to hold within its full width at half maximum."""
-
-NEAR = 10.0
-"""Degrees from the mirror direction within which steps of a scan count."""
+STEPS = 2.0  # of a scan, that a lobe has to hold within its full width at half maximum
+NEAR = 10.0  # degrees from the mirror direction within which steps of a scan count
 
 
 def instrument_limits(fit: Fit) -> dict[str, float]:

@@ -1,23 +1,23 @@
 """The starts of a fit: where they begin, where each of them ends, and the lowest followed to its very minimum.
 
-Levenberg-Marquardt follows them. L-BFGS-B of scipy, by jaxopt and with gradients only, shares nothing with it but the
-objective: it checks a minimum that lies on a bound or has not converged. A start that reaches the maximum of steps is
-continued while it gains something: the number of steps says nothing about how good its outcome is.
+Levenberg-Marquardt follows them, and continues a start that reaches the maximum of steps while it gains something.
+L-BFGS-B of scipy, by jaxopt and with gradients only, shares nothing with it but the objective: it checks a minimum that
+lies on a bound or has not converged.
 """
 
 import warnings
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import qmc
 
 import layerjax
+from fits.data.geometry import Floats
 from fits.optimise.levenberg_marquardt import COST_TOLERANCE, ROUGH_TOLERANCE, Descent, descent, evaluate_at
 from fits.optimise.uncertainty import Uncertainty, uncertainty
 from fits.problem.compilation import cores, on_all_cores
@@ -27,34 +27,12 @@ from fits.progress import Progress
 from fits.store import Store, fingerprint
 from layerjax._numerics import broadcasting
 
-Floats = NDArray[np.float64]
-
-MOST_STEPS, MOST_ROUNDS = 200, 20
-"""Steps of a start in a round; and rounds, while each gains `LEAST_GAIN`."""
-LEAST_GAIN, LEAST_RELATIVE_GAIN = 1e-3, 1e-6
-"""In the log-posterior; and for a named objective, as a share of the cost."""
-EARLY, FRONT = 20, 3
-"""Steps, with sigma held and with it free, after which starts are screened, and how many of them are continued."""
-LBFGSB_STEPS, LBFGSB_TOLERANCE, LEAST_STEP_GAIN = 500, 1e-12, 1e-5
-"""The check by L-BFGS-B ends after so many steps; where the gradient of a named objective is below the second; where a
-step gains less than the last in the log-posterior."""
-
-
-class StartOutcome(NamedTuple):
-    """Where one start ended: physical vector (P,), cost, steps, whether it converged, whether it reached the maximum of
-    steps."""
-
-    vector: Floats
-    cost: float
-    steps: int
-    converged: bool
-    max_steps_reached: bool
-
-    @classmethod
-    def of(cls, end: Descent, steps_before: int = 0) -> "StartOutcome":
-        """The outcome of a descent, after so many steps before it."""
-        steps = steps_before + int(end.steps)
-        return cls(end.vector, float(end.cost), steps, bool(end.converged), bool(end.max_steps_reached))
+MOST_STEPS, MOST_ROUNDS = 200, 20  # steps of a start in a round; and rounds, while each gains the next
+LEAST_GAIN, LEAST_RELATIVE_GAIN = 1e-3, 1e-6  # in the log-posterior; for a named objective, as a share of the cost
+EARLY, FRONT = 20, 3  # steps with sigma held, and free, after which starts are screened; how many are continued
+LBFGSB_STEPS = 500  # after which the check by L-BFGS-B ends, or where
+LEAST_STEP_GAIN = 1e-5  # a step gains less than this in the log-posterior, or
+LBFGSB_TOLERANCE = 1e-12  # the gradient of a named objective is below this
 
 
 def start_points(problem: FittingProblem, starts: int, seed: int) -> Floats:
@@ -66,19 +44,19 @@ def start_points(problem: FittingProblem, starts: int, seed: int) -> Floats:
 
 def multi_start(
     problem: FittingProblem, points: Floats, progress: Progress, store: Store | None = None
-) -> list[StartOutcome]:
+) -> list[Descent]:
     """Where each of the points (starts, P) in the unit box ends, roughly; those that are in the store are not run."""
-    ends: dict[int, StartOutcome] = {}
+    ends: dict[int, Descent] = {}
 
-    def ended(index: int, end: StartOutcome) -> None:
+    def ended(index: int, end: Descent) -> None:
         ends[index] = end
         if store is not None and store.get(f"start {index}") is None:
-            store.put(f"start {index}", end._asdict())
+            store.put(f"start {index}", end._replace(gradient=None, root=None, predicted=None)._asdict())
         progress("fit", len(ends), len(points), f"best cost {min(end.cost for end in ends.values()):.6g}")
 
     for index in range(len(points)):
         if store is not None and (stored := store.get(f"start {index}")) is not None:
-            ended(index, StartOutcome(**stored))
+            ended(index, Descent(**stored))
     left = [index for index in range(len(points)) if index not in ends]
     for index in left[:1]:  # alone: it compiles the program, which keeps one core busy
         ended(index, rough_descent(problem, points[index]))
@@ -92,8 +70,12 @@ def multi_start(
     return [ends[index] for index in range(len(points))]
 
 
-def starts_store(checkpoint: str | Path, problem: FittingProblem, points: Floats) -> AbstractContextManager[Store]:
-    """The store of the starts of a fit; starts of another fit that are there are thrown away."""
+def starts_store(
+    checkpoint: str | Path | None, problem: FittingProblem, points: Floats
+) -> AbstractContextManager[Store | None]:
+    """The store of the starts of a fit, if there is a path; starts of another fit that are there are thrown away."""
+    if checkpoint is None:
+        return nullcontext()
     arrays, static = problem.split_model
     whose = fingerprint(
         version=layerjax.__version__,
@@ -107,13 +89,13 @@ def starts_store(checkpoint: str | Path, problem: FittingProblem, points: Floats
     return Store.open(checkpoint, whose, replace=True)
 
 
-def screened_starts(problem: FittingProblem, points: Floats) -> list[StartOutcome]:
+def screened_starts(problem: FittingProblem, points: Floats) -> list[Descent]:
     """Where the points (starts, P) in the unit box end if only those go on that are lowest after a few steps."""
 
-    def early(point: Floats) -> StartOutcome:
-        return StartOutcome.of(descent(problem, point, True, EARLY, ROUGH_TOLERANCE))
+    def early(point: Floats) -> Descent:
+        return descent(problem, point, True, EARLY, ROUGH_TOLERANCE)
 
-    def onward(end: StartOutcome) -> StartOutcome:
+    def onward(end: Descent) -> Descent:
         if not end.max_steps_reached:
             return end
         further = rough_descent(problem, unit_of(problem, end.vector), fresh=False)
@@ -128,20 +110,20 @@ def screened_starts(problem: FittingProblem, points: Floats) -> list[StartOutcom
 
 def least_squares_descent(
     problem: FittingProblem, point: Floats, fresh: bool = True, tolerance: float = COST_TOLERANCE
-) -> StartOutcome:
+) -> Descent:
     """Levenberg-Marquardt from a point (P,) in the unit box. Not `fresh`: near a minimum, with sigma free at once."""
-    end = StartOutcome(point, np.inf, 0, False, True)
+    end = Descent(point, np.inf, 0, False, True)
     for _ in range(MOST_ROUNDS):
-        before = end.cost
-        end = StartOutcome.of(descent(problem, point, fresh, MOST_STEPS, tolerance), end.steps)
+        before, end = end, descent(problem, point, fresh, MOST_STEPS, tolerance)
+        end = end._replace(steps=before.steps + end.steps)
         least_gain = LEAST_GAIN if problem.objective == "likelihood" else LEAST_RELATIVE_GAIN * end.cost
-        if not end.max_steps_reached or not before - end.cost > least_gain:
+        if not end.max_steps_reached or not before.cost - end.cost > least_gain:
             break
         point, fresh = unit_of(problem, end.vector), False
     return end
 
 
-def rough_descent(problem: FittingProblem, point: Floats, fresh: bool = True) -> StartOutcome:
+def rough_descent(problem: FittingProblem, point: Floats, fresh: bool = True) -> Descent:
     """As `least_squares_descent`, so near a minimum that it is distinguished from others."""
     return least_squares_descent(problem, point, fresh, ROUGH_TOLERANCE)
 
@@ -151,11 +133,10 @@ def unit_of(problem: FittingProblem, vector: Floats) -> Floats:
     return np.asarray(problem.model.box.to_unit(jnp.asarray(vector)), float)
 
 
-def lbfgsb_polish(problem: FittingProblem, end: StartOutcome) -> tuple[StartOutcome, bool]:
+def lbfgsb_polish(problem: FittingProblem, end: Descent) -> tuple[Descent, bool]:
     """The end, or what L-BFGS-B and then Levenberg-Marquardt make of it if that is lower; and whether it is.
 
-    A check on what lies on a bound or has not converged: the two share nothing but the objective. An end that neither
-    of them improves has converged if one of them says so.
+    An end that neither of them improves has converged if one of them says so.
     """
 
     def value_and_gradient(unit: Floats) -> tuple[Floats, Floats]:  # the gradient in reverse would be compiled for this
@@ -190,12 +171,11 @@ def lbfgsb_polish(problem: FittingProblem, end: StartOutcome) -> tuple[StartOutc
 class Optimum(NamedTuple):
     """The outcomes of all starts, the place of the lowest among them, and what is known there.
 
-    improved: whether L-BFGS-B found what Levenberg-Marquardt had not. predicted: (N, C), in 1/sr. excess: what
-    differences in cost count in, see `FitOptions`.
+    improved: by L-BFGS-B. predicted: (N, C), in 1/sr. excess: what differences in cost count in, see `FitOptions`.
     """
 
     problem: FittingProblem
-    ends: list[StartOutcome]
+    ends: list[Descent]
     best: int
     uncertainty: Uncertainty
     improved: bool
@@ -203,17 +183,13 @@ class Optimum(NamedTuple):
     excess: float
 
     @property
-    def lowest(self) -> StartOutcome:
+    def lowest(self) -> Descent:
         """The lowest end, exactly on the bounds that hold it."""
         return self.ends[self.best]
 
 
 def polish(
-    problem: FittingProblem,
-    ends: list[StartOutcome],
-    *,
-    check: bool = True,
-    tolerance: float = COST_TOLERANCE,
+    problem: FittingProblem, ends: list[Descent], *, check: bool = True, tolerance: float = COST_TOLERANCE
 ) -> Optimum:
     """The lowest of the ends, followed to its very minimum, and checked by L-BFGS-B where it has not converged.
 
@@ -247,10 +223,9 @@ def polish(
     lowest = lowest._replace(vector=np.where(held, nearest, np.clip(vector, low, high)))
     predicted = evaluate_at(problem, unit_of(problem, lowest.vector)).predicted if held.any() else found.predicted
     # 5. the reduced chi-square where it is above 1; of a named objective, the residual variance
-    freedom = max(problem.count - len(lowest.vector), 1)
-    if likelihood:
+    freedom, excess = problem.count - len(lowest.vector), 1.0
+    if not likelihood:
+        excess = 2.0 * lowest.cost / max(freedom, 1)
+    elif freedom > 0:
         excess = max(1.0, float(problem.call(Model.chi_square_at, lowest.vector, predicted)) / freedom)
-        excess = excess if problem.count > len(lowest.vector) else 1.0
-    else:
-        excess = 2.0 * lowest.cost / freedom
     return Optimum(problem, [*ends[:best], lowest, *ends[best + 1 :]], best, found, improved, predicted, excess)

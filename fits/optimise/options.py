@@ -43,7 +43,6 @@ DEFAULT = FitOptions()
 def options_from(table: Mapping[str, Any]) -> FitOptions:
     """The options that the ``[options]`` of a stack file changes. ValueError for a key that is none of them."""
     known = [entry.name for entry in fields(FitOptions)]
-    unknown = [key for key in table if key not in known]
-    if unknown:
+    if unknown := [key for key in table if key not in known]:
         raise ValueError(f"[options] has an unknown key {unknown[0]!r}; it must be one of {', '.join(known)}")
     return FitOptions(**table)

@@ -8,7 +8,7 @@ instrument are those that the lobe asks for that was found.
 """
 
 import warnings
-from collections.abc import Callable, Mapping, Set
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple, cast
 
@@ -16,10 +16,11 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from numpy.typing import NDArray
 
 import layerjax as lj
-from fits.optimise.multi_start import Optimum, StartOutcome, polish, rough_descent, unit_of
+from fits.data.geometry import Floats
+from fits.optimise.levenberg_marquardt import Descent
+from fits.optimise.multi_start import Optimum, polish, rough_descent, unit_of
 from fits.optimise.options import FitOptions
 from fits.problem.instrument import rings_for
 from fits.problem.model import Model
@@ -29,24 +30,13 @@ from layerjax.mixture import stacks_of
 from layerjax.preparation import transport_for
 from layerjax.transport.adding_doubling.resolution import is_tilted
 
+# the finest resolution of starts, and their most rings of a cone: finer ones cost more than they tell far from the data
 FAR, FAR_RINGS = {"nodes": 12, "modes": 16, "ordinates": (8, 12)}, 2
-"""The finest resolution of starts, and their most rings of a cone: what is finer costs more than it tells far away from
-the data."""
-
-FINEST_NODES, FINEST_MODES, FINEST_COSINES = 48, 96, 16
-"""What is chosen at most."""
-
-MINOR_SHARE = 0.5
-"""Of the numerical error that is allowed: left to nodes or modes where the other is what has to be finer."""
-
-LEAST_SCATTER = 0.01
-"""Of the data's root mean square: less scatter about a named objective counts as this, so that an error of a thousandth
-is enough, which `AddingDoubling` aims at."""
-
-SAME_OUTCOME, MOST_MINIMA = 0.01, 8
-"""Of the box: ends that are closer in every parameter are fitted again as one; and the most that are."""
-
-Floats = NDArray[np.float64]
+FINEST_NODES, FINEST_MODES, FINEST_COSINES = 48, 96, 16  # what is chosen at most
+MINOR_SHARE = 0.5  # of the numerical error that is allowed: left to nodes or modes where the other has to be finer
+LEAST_SCATTER = 0.01  # of the data's root mean square: less scatter about a named objective counts as this
+SAME_OUTCOME = 0.01  # of the box: ends that are closer in every parameter are fitted again as one
+MOST_MINIMA = 8  # that are fitted again
 
 
 # ---- of the transport ----
@@ -56,10 +46,8 @@ Floats = NDArray[np.float64]
 class Resolutions:
     """The resolutions that a transport may take for a problem.
 
-    Attributes:
-        stated: the transport, as far as it is stated.
-        chosen: the same with nothing left open, for the start values.
-        tilted: whether the stack is solved by ordinates, not by nodes and modes, as is decided while tracing.
+    stated: the transport, as far as it is stated. chosen: the same with nothing left open, for the start values.
+    tilted: whether the stack is solved by ordinates, not by nodes and modes, as is decided while tracing.
     """
 
     stated: lj.AddingDoubling
@@ -75,18 +63,15 @@ class Resolutions:
     def far(self) -> lj.AddingDoubling:
         """The resolution that starts are fitted at: the chosen one, but no finer than is of use there."""
         least = {name: min(getattr(self.chosen, name), most) for name, most in FAR.items()}
-        return self._as_given(replace(self.chosen, **least))
+        return self.as_stated(replace(self.chosen, **least))
 
     def finer(self, transport: lj.AddingDoubling) -> lj.AddingDoubling | None:
         """The transport at the next finer resolution; None beyond the finest that is chosen."""
-        finer = self._as_given(transport.finer())
+        finer = self.as_stated(transport.finer())
         if self.open and not self.tilted:  # what is as fine as it gets stays, the other is refined
-            nodes, modes = transport.nodes or 0, transport.modes or 0
-            finer = replace(
-                transport,
-                nodes=max(nodes, min(finer.nodes or 0, FINEST_NODES)),
-                modes=max(modes, min(finer.modes or 0, FINEST_MODES)),
-            )
+            nodes = max(transport.nodes or 0, min(finer.nodes or 0, FINEST_NODES))
+            modes = max(transport.modes or 0, min(finer.modes or 0, FINEST_MODES))
+            finer = replace(transport, nodes=nodes, modes=modes)
         elif ((finer.ordinates or (0, 0))[0] > FINEST_COSINES) if self.tilted else (finer.nodes or 0) > FINEST_NODES:
             return None
         return None if finer == transport else finer
@@ -98,17 +83,13 @@ class Resolutions:
         parts = [replace(transport, modes=finer.modes), replace(transport, nodes=finer.nodes)]
         return [part for part in parts if part not in (transport, finer)]
 
-    def coarser(self, transport: lj.AddingDoubling) -> lj.AddingDoubling:
-        """The transport at the next coarser resolution."""
-        return self._as_given(transport.coarser())
-
     def in_words(self, transport: lj.AddingDoubling) -> str:
         """Such as "12 nodes, 16 modes"."""
         if self.tilted:
             return "{} cosines, {} azimuths".format(*transport.ordinates or ("?", "?"))
         return f"{transport.nodes} nodes, {transport.modes} modes"
 
-    def _as_given(self, transport: lj.AddingDoubling) -> lj.AddingDoubling:
+    def as_stated(self, transport: lj.AddingDoubling) -> lj.AddingDoubling:
         """The transport with what the user gave put back in; unchanged where the user left nothing to choose."""
         if not self.open:
             return transport
@@ -188,7 +169,7 @@ def needed_resolution(
     """The coarsest resolution from this one on that is fine enough, its error, and whether none is finer."""
     finer = known.finer(transport)
     if finer is None:
-        return transport, error(known.coarser(transport), transport), True
+        return transport, error(known.as_stated(transport.coarser()), transport), True
     found = error(transport, finer)
     while known.open and found > allowed:
         parts = known.partly_finer(transport, finer)
@@ -215,24 +196,23 @@ def leaves_rays_open(problem: Problem) -> bool:
 
 def with_rings(problem: Problem, rings: int) -> Problem:
     """The problem with so many rings of rays a cone."""
-    assert problem.instrument is not None
-    return replace(problem, instrument=replace(problem.instrument, rings=rings))
+    return replace(problem, instrument=replace(cast(Any, problem.instrument), rings=rings))
 
 
 def rings_of_lobes(problem: Problem, vector: Floats) -> int:
     """Rings of rays a cone that the lobes of the stack ask for with this vector (P,)."""
     parts, data = problem.build(vector), problem.data.used()
-    assert problem.instrument is not None
-    return rings_for(problem.instrument, parts.instrument, parts.stack, data.wi, data.wo)
-
-
-def error_of_rays(problem: Problem, vector: Floats, predicted: Floats) -> float:
-    """What other rays for the cones change of what a vector predicts at most, in standard deviations of the data."""
-    other = np.asarray(problem.with_other_rays().predict(vector), float)
-    return float(np.max(np.abs(predicted - other) / spread(problem, vector, predicted)))
+    return rings_for(cast(Any, problem.instrument), parts.instrument, parts.stack, data.wi, data.wo)
 
 
 # ---- refinement of an optimum ----
+
+
+class Choice(NamedTuple):
+    """What a fit may choose of a data set: among resolutions of its transport, if that has any; how many rays."""
+
+    resolutions: Resolutions | None
+    rays: bool
 
 
 class Accuracy(NamedTuple):
@@ -243,55 +223,71 @@ class Accuracy(NamedTuple):
     words: str
 
 
-def refined(
-    at: Optimum,
-    known: Mapping[str, Resolutions],
-    open_rays: Set[str],
-    options: FitOptions,
-    progress: Progress,
-) -> tuple[Optimum, Accuracy]:
-    """The optimum at the resolution that the noise of each measurement asks for; at the given one where one is given.
+def for_starts(problem: FittingProblem) -> tuple[FittingProblem, dict[str, Choice]]:
+    """The problem as starts are fitted, coarsely where that is open, and the choices of its data sets by name."""
+    choices = {name: Choice(resolutions(one), leaves_rays_open(one)) for name, one in problem.problems.items()}
+    coarse = {}
+    for name, (known, rays) in choices.items():
+        one = problem.problems[name]
+        if known is not None and known.open:
+            one = replace(one, transport=known.far)
+        coarse[name] = with_rings(one, min(rings_of_lobes(one, one.start), FAR_RINGS)) if rays else one
+    changed = {name: one for name, one in coarse.items() if one is not problem.problems[name]}
+    return problem.with_problems(changed), choices
 
-    known: of those measurements whose transport has one, by name. open_rays: names of those whose instrument leaves
-    open how many rays stand for its cones.
-    """
+
+def refined(
+    at: Optimum, choices: Mapping[str, Choice], options: FitOptions, progress: Progress
+) -> tuple[Optimum, Accuracy | None]:
+    """The optimum at the resolution that the noise of each data set asks for, or at the given one; None: there is no
+    resolution."""
     while True:
-        accuracies: dict[str, Accuracy] = {}
-        changed: dict[str, Problem] = {}
+        changed, accuracies = {}, {}
         for name, predicted in at.problem.shares(at.predicted).items():
-            problem = at.problem.problems[name]
-            vector, needed, errors, words = at.lowest.vector[list(at.problem.places(name))], problem, [], []
-            if (one := known.get(name)) is not None:
-                own = transport_of(problem, one)
-                progress("numerical error", 0, None, f"at {one.in_words(own)}")
-                between = error_between(problem, own, vector, predicted)
-                transport, error, finest = needed_resolution(one, own, between, options.numerical_error)
-                if one.open and transport != own:
-                    needed = replace(needed, transport=transport)
-                errors.append(error)
-                words.append(_error_in_words(one.in_words(own), error, finest, one.open))
-            if has_rays(problem):
-                instrument, is_open = cast(Any, problem.instrument), name in open_rays
-                if is_open and (rings := rings_of_lobes(problem, vector)) > instrument.rings:
-                    needed = replace(needed, instrument=replace(instrument, rings=rings))
-                errors.append(error_of_rays(problem, vector, predicted) if needed is problem else np.nan)
-                words.append(_error_in_words(_rings_in_words(problem), errors[-1], False, is_open))
+            problem, vector = at.problem.problems[name], at.lowest.vector[list(at.problem.places(name))]
+            needed, accuracy = _judged(problem, choices[name], vector, predicted, options, progress)
             if needed is not problem:
                 changed[name] = needed
-            if errors:  # of one measurement errors add up
-                resolution = resolution_in_words(problem, one)
-                said = f"numerical error of the model: {', '.join(words)}"
-                accuracies[name] = Accuracy(resolution, float(np.sum(errors)), said)
+            if accuracy is not None:
+                accuracies[name] = accuracy
+        if not accuracies:
+            return at, None
         if not changed:
-            resolution, said = (
-                _by_name({name: getattr(one, of) for name, one in accuracies.items()}) for of in ("resolution", "words")
+            resolution, words = (
+                "; ".join(f"{name}: {one[place]}" if name else str(one[place]) for name, one in accuracies.items())
+                for place in (0, 2)
             )
-            return at, Accuracy(resolution, float(np.max([one.error for one in accuracies.values()])), said)
+            return at, Accuracy(resolution, float(np.max([one.error for one in accuracies.values()])), words)
         whole = at.problem.with_problems(changed)
-        resolution = _by_name({name: resolution_in_words(whole.problems[name], known.get(name)) for name in accuracies})
-        ends = _fitted_again(at, whole, resolution, options.equivalent_cost, progress)
-        again = polish(whole, ends, check=at.improved)
+        again = polish(whole, _fitted_again(at, whole, options.equivalent_cost, progress), check=at.improved)
         at = again._replace(improved=again.improved or at.improved)
+
+
+def _judged(
+    problem: Problem, choice: Choice, vector: Floats, predicted: Floats, options: FitOptions, progress: Progress
+) -> tuple[Problem, Accuracy | None]:
+    """The data set at the resolution that its noise asks for, and how accurate it is now."""
+    needed, errors, words = problem, [], []
+    if (known := choice.resolutions) is not None:
+        own = transport_of(problem, known)
+        progress("numerical error", 0, None, f"at {known.in_words(own)}")
+        between = error_between(problem, own, vector, predicted)
+        transport, error, finest = needed_resolution(known, own, between, options.numerical_error)
+        if known.open and transport != own:
+            needed = replace(needed, transport=transport)
+        errors.append(error)
+        words.append(_error_in_words(known.in_words(own), error, finest, known.open))
+    if has_rays(problem):
+        rings = rings_of_lobes(problem, vector) if choice.rays else 0
+        if rings > (cast(Any, problem.instrument).rings or 0):
+            needed = with_rings(needed, rings)
+        other = problem.with_other_rays().predict(vector) if needed is problem else np.nan
+        errors.append(float(np.max(np.abs(predicted - np.asarray(other)) / spread(problem, vector, predicted))))
+        words.append(_error_in_words(_rings_in_words(problem), errors[-1], False, choice.rays))
+    if not errors:
+        return problem, None
+    said = f"numerical error of the model: {', '.join(words)}"
+    return needed, Accuracy(resolution_in_words(problem, known), float(np.sum(errors)), said)  # errors add up
 
 
 def transport_of(problem: Problem, known: Resolutions) -> lj.AddingDoubling:
@@ -319,16 +315,10 @@ def _error_in_words(resolution: str, error: float, finest: bool, is_open: bool) 
     return f"{error:.2g} sigma at most at {resolution}{'' if is_open else ', as given'}"
 
 
-def _by_name(words: Mapping[str, str]) -> str:
-    return "; ".join(f"{name}: {one}" if name else one for name, one in words.items())
-
-
-def _fitted_again(
-    at: Optimum, problem: FittingProblem, words: str, equivalent: float, progress: Progress
-) -> list[StartOutcome]:
+def _fitted_again(at: Optimum, problem: FittingProblem, equivalent: float, progress: Progress) -> list[Descent]:
     """The ends at another resolution: those that matter fitted again, the cost of the others there."""
 
-    def with_cost(end: StartOutcome) -> StartOutcome:
+    def with_cost(end: Descent) -> Descent:
         found = float(problem.call(Model.cost_at, end.vector, problem.predict(end.vector)))
         return end._replace(cost=found if np.isfinite(found) else np.inf)
 
@@ -348,5 +338,5 @@ def _fitted_again(
                 result[index] = end._replace(steps=before.steps + end.steps)
                 fitted.append(index)
                 best = min(end.cost for end in result)
-                progress(f"fit at {words}", len(fitted), None, f"best cost {best:.6g}")
+                progress("refined fit", len(fitted), None, f"best cost {best:.6g}")
     return result

@@ -6,22 +6,20 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fits._lazy import shown_by
+from fits.data.geometry import Floats
 from fits.optimise.uncertainty import Direction
 from fits.problem.model import Model
 from fits.problem.problem import Problem
 
-Floats = NDArray[np.float64]
-
+# what is said of the starts that ended in each way (see `Fit.start_outcomes`)
 OUTCOMES = {
     "best minimum": "converged to the best minimum",
     "local minima": "converged to other local minima",
     "maximum steps reached": "reached the maximum of steps",
     "failed": "failed",
 }
-"""What is said of the starts that ended in each way (see `Fit.start_outcomes`)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +36,7 @@ class Minimum:
 class WithoutDiscrepancy:
     """The same stack fitted with independent noise: values and standard errors by name, how well.
 
-    residual_autocorrelation: of neighbours along the scans. pairs: of them.
+    residual_autocorrelation: of so many `pairs` of neighbours along the scans.
     """
 
     values: dict[str, float]
@@ -75,12 +73,10 @@ class Fit:
         settings: starts, seed, and the numbers of `FitOptions`.
         start_outcomes: how many starts ended where: "best minimum", "local minima", "maximum steps reached", "failed".
         numerical_error: of the model at the best values, in standard deviations of the data (for a named objective, of
-            the residuals): the largest, as the difference from a finer resolution tells, or where that is out of reach
-            from a coarser one, which is more than it; that of the rays for an instrument's cones is added. None where
-            there is neither a resolution nor a cone.
+            the residuals): the largest difference from a finer resolution, or where that is out of reach from a coarser
+            one, which is more; that of the rays for an instrument's cones is added. None where there is neither.
         resolution: of the transport, and the rays for cones, in words; None where there is neither. `problem` holds it.
-        without_discrepancy: the fit without model discrepancy, where its residuals showed that one is needed (see
-            `Noise`); else None.
+        without_discrepancy: the fit without model discrepancy, if residuals showed that one is needed (see `Noise`).
         without_discrepancy_parts: of a `Joint`, the same by the names of measurements.
         dataset: of one measurement of a `Joint`, its name there.
     """
@@ -108,9 +104,8 @@ class Fit:
     dataset: str | None = None
 
     def __repr__(self) -> str:
-        values = ", ".join(
-            f"{name} {value:.4g} ± {self.standard_errors[name]:.2g}" for name, value in self.values.items()
-        )
+        numbers = zip(self.problem.names, self.vector, self.errors, strict=True)
+        values = ", ".join(f"{name} {value:.4g} ± {error:.2g}" for name, value, error in numbers)
         return f"<Fit to {self.problem.count} measurements: {values}; {self.status}>"
 
     def _repr_html_(self) -> str:
@@ -120,9 +115,7 @@ class Fit:
         """What the fit of a `Joint` says of one measurement, with errors that all of them leave it; itself, if alone.
 
         It predicts by the normal approximation of what all measurements say; `Posterior.part` by their draws.
-
-        Raises:
-            ValueError: a name that no measurement has.
+        ValueError for a name that no measurement has.
         """
         own = list(self.problem.places(name))
         problem = self.problem.problems[name]
@@ -133,9 +126,9 @@ class Fit:
         def names(some: tuple[str, ...]) -> tuple[str, ...]:
             return tuple(called[name] for name in some if name in called)
 
-        def minima(some: tuple[Minimum, ...]) -> tuple[Minimum, ...]:
-            values = [{plain: one.values[whole] for whole, plain in called.items()} for one in some]
-            return tuple(replace(one, values=v, stack=one.stack[name]) for one, v in zip(some, values, strict=True))
+        def minimum(one: Minimum) -> Minimum:
+            values = {plain: one.values[whole] for whole, plain in called.items()}
+            return replace(one, values=values, stack=one.stack[name])
 
         found = replace(
             self,
@@ -146,8 +139,8 @@ class Fit:
             at_bound=names(self.at_bound),
             insensitive=names(self.insensitive),
             unidentified=tuple(one.renamed(called) for one in self.unidentified if set(one.weights) & set(called)),
-            minima=minima(self.minima),
-            alternatives=minima(self.alternatives),
+            minima=tuple(map(minimum, self.minima)),
+            alternatives=tuple(map(minimum, self.alternatives)),
             without_discrepancy=self.without_discrepancy_parts.get(name),
             dataset=name,
         )
@@ -160,13 +153,13 @@ class Fit:
         if problems.get("") is not self.problem:
             raise ValueError(f"{what}: of a joint fit it takes a part: fit.part(...) of {', '.join(problems)}")
 
-    def require_alone(self, what: str) -> None:
-        """ValueError, for `what` asks the data anew, of one measurement of several: its problem has no others."""
+    def require_posterior(self, what: str) -> None:
+        """ValueError, for `what` asks for the posterior anew, of a named objective, or of a part of a joint fit."""
+        if not self.is_posterior:
+            raise ValueError(f"{what}: a fit of {self.problem.objective!r} has no noise model, and so no posterior")
         if self.dataset is not None:
-            raise ValueError(
-                f"{what}: {self.dataset!r} is a part of a joint fit, and without the others it says something "
-                "else; fit it by itself, or take the whole fit"
-            )
+            words = "without the others it says something else; fit it by itself, or take the whole fit"
+            raise ValueError(f"{what}: {self.dataset!r} is a part of a joint fit, and {words}")
 
     @property
     def values(self) -> dict[str, float]:

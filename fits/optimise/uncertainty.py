@@ -2,8 +2,7 @@
 
 All follow from the Fisher information A'A (see `Model.linear_parts`), with one column of A a parameter in units of
 its box. A singular value s of A says that the parameters can move by 1 / s of their boxes along its direction before
-the fit worsens by one standard deviation; neither priors nor bounds count there, which may hold a parameter that the
-data do not. It is a statement about small changes: along a curved valley the direction turns.
+the fit worsens by one standard deviation, priors and bounds apart. Along a curved valley the direction turns.
 """
 
 import math
@@ -14,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
+from fits.data.geometry import Floats
 from fits.optimise.levenberg_marquardt import evaluate_at
 from fits.problem.problem import FittingProblem
 
@@ -25,8 +25,6 @@ UNKNOWN_BEYOND = 1e3  # boxes: a larger error is reported as infinite
 LARGEST_ERROR = 1e9  # boxes: stands for all larger ones, so that squares of it can be formed
 CERTAIN_MEMBER = 0.05  # weight from which a parameter belongs to a direction
 MEMBER, OWED = 0.01, 0.25  # weight from which it does so if it owes the direction this share of its variance
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -65,13 +63,10 @@ class Direction:
 class Uncertainty:
     """Errors at an optimum with P parameters, in physical units.
 
-    at_bound: (P,) bool: the value lies on a bound and the fit would go on improving beyond it (an insensitive one lies
-    where it happens to). Errors, covariance and condition number are conditional on these values; their own errors are
-    NaN and their rows of the covariance 0.
-    standard_errors: (P,), infinite where nothing holds a parameter.
-    unidentified: the combinations that the data do not resolve, of all parameters, also those at a bound.
-    insensitive: names of those that the data say nothing about at all.
-    predicted: the model at the optimum, (N, C), in 1/sr.
+    at_bound: (P,) bool: the fit would go on improving beyond the bound. Errors, covariance and condition number are
+    conditional on these values; their own errors are NaN and their rows of the covariance 0. standard_errors: (P,),
+    infinite where nothing holds a parameter. unidentified: the combinations, of all parameters, that the data do not
+    resolve. insensitive: names of those that the data say nothing about. predicted: (N, C), in 1/sr, there.
     """
 
     at_bound: NDArray[np.bool_]
@@ -93,9 +88,8 @@ def uncertainty(problem: FittingProblem, vector: Floats, cost: float) -> Uncerta
     found = evaluate_at(problem, unit)
     data_root, gradient = found.root, found.gradient
     if not (np.isfinite(found.cost) and np.all(np.isfinite(data_root))):
-        nowhere = np.zeros(count, bool)
-        infinite = np.full(count, np.inf)
-        return Uncertainty(nowhere, infinite, np.zeros((count, count)), float("inf"), (), (), found.predicted)
+        nowhere, infinite = np.zeros(count, bool), np.full(count, np.inf)
+        return Uncertainty(nowhere, infinite, np.zeros((count, count)), math.inf, (), (), found.predicted)
     scatter = 1.0  # what a difference in cost is measured in
     if problem.objective != "likelihood":
         scatter = max(2.0 * cost / max(problem.count - count, 1), np.finfo(float).tiny)
@@ -117,22 +111,16 @@ def uncertainty(problem: FittingProblem, vector: Floats, cost: float) -> Uncerta
         spread = np.sqrt(np.diagonal(boxes))
         errors[free] = np.where(spread > UNKNOWN_BEYOND, np.inf, spread * width[free])
         covariance[np.ix_(free, free)] = boxes * np.outer(width[free], width[free])
-    return Uncertainty(
-        at_bound, errors, covariance, condition_number(data_root), unidentified, insensitive, found.predicted
-    )
+    condition = condition_number(data_root)
+    return Uncertainty(at_bound, errors, covariance, condition, unidentified, insensitive, found.predicted)
 
 
 def local_information(problem: FittingProblem, unit: Floats) -> tuple[Floats, Floats, float]:
-    """Rows of A, of the data and the prior, (rows, P), anywhere in the unit box: A'A is the information in boxes^-2.
-
-    And the gradient of the negative log-posterior there, (P,), in boxes^-1, and this itself up to a constant.
-    """
+    """Rows of A, of the data and the prior, (rows, P), anywhere in the unit box: A'A is the information in boxes^-2;
+    the gradient of the negative log-posterior there, (P,), in boxes^-1; and this itself up to a constant."""
     found = evaluate_at(problem, unit)
-    return (
-        np.vstack([found.root, np.asarray(problem.model.box.prior_slopes(), float)]),
-        found.gradient,
-        float(found.cost),
-    )
+    rows = np.vstack([found.root, np.asarray(problem.model.box.prior_slopes(), float)])
+    return rows, found.gradient, float(found.cost)
 
 
 def condition_number(root: Floats) -> float:
@@ -150,8 +138,8 @@ def unidentified_directions(root: Floats, names: tuple[str, ...], width: Floats)
     """Directions known to no better than a tenth of the box, worst first.
 
     root: rows A of the data alone, (rows, P), in units of the boxes. width: of the boxes, (P,), in physical units.
-    Members are the parameters that move along a direction by more than a twentieth of its length, or a hundredth where
-    they owe it a quarter of their variance (Belsley, Kuh and Welsch 1980, variance proportions).
+    Members move along a direction by more than a twentieth of its length, or a hundredth where they owe it a quarter of
+    their variance (Belsley, Kuh and Welsch 1980, variance proportions).
     """
     _, values, directions = np.linalg.svd(square(root))
     errors = 1.0 / floored(values)
@@ -164,11 +152,8 @@ def unidentified_directions(root: Floats, names: tuple[str, ...], width: Floats)
         if error <= UNIDENTIFIED_BEYOND:
             break
         direction = direction * np.sign(direction[np.argmax(np.abs(direction))])
-        members = [
-            index
-            for index in np.argsort(-np.abs(direction), kind="stable")
-            if abs(direction[index]) > (MEMBER if owed[index] > OWED else CERTAIN_MEMBER)
-        ]
+        size, least = np.abs(direction), np.where(owed > OWED, MEMBER, CERTAIN_MEMBER)
+        members = [index for index in np.argsort(-size, kind="stable") if size[index] > least[index]]
         found.append(
             Direction(
                 error=float(error) if error < UNKNOWN_BEYOND else math.inf,

@@ -13,12 +13,11 @@ from fits.prediction.cross_validation import model_scores
 from fits.prediction.options import ComparisonOptions
 from fits.prediction.predict import DRAWS, Prediction, predict
 from fits.progress import Progress
-from fits.sampling.posterior import Posterior, require_fits
+from fits.sampling.posterior import Posterior
 from layerjax._checks import require_kind
 from layerjax.compiling import programs_kept
 
-LINEAR = 1e6
-"""Softness that makes the logarithm linear, in units of the largest value: asinh(x / s) is x / s there."""
+LINEAR = 1e6  # softness that makes the logarithm linear, in units of the largest value: asinh(x / s) is x / s there
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,19 +73,17 @@ def average(
     Raises:
         ValueError: no candidate; weights that are missing, negative or all 0; or as `cross_validate`.
     """
-    require_fits(candidates)
+    fits = fits_of(candidates)
     require_kind("weights", weights, Mapping, None)
     require_kind("options", options, ComparisonOptions, None)
     if not candidates:
         raise ValueError("average: there is no fit to average")
     if weights is None:
-        scores = model_scores(fits_of(candidates), progress, options)
-        weights = {name: score.weight for name, score in scores.items()}
+        weights = {name: score.weight for name, score in model_scores(fits, progress, options).items()}
     total = float(sum(weights.get(name, np.nan) for name in candidates))
     if set(weights) != set(candidates) or min(weights.values()) < 0.0 or not total > 0.0:
-        raise ValueError(
-            f"weights is {dict(weights)}; it must give each of {', '.join(candidates)} a number of at least 0"
-        )
+        words = f"it must give each of {', '.join(candidates)} a number of at least 0"
+        raise ValueError(f"weights is {dict(weights)}; {words}")
     return Average(dict(candidates), {name: weights[name] / total for name in candidates})
 
 

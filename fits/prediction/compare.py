@@ -10,9 +10,9 @@ from fits._files import require_switch
 from fits._lazy import shown_by
 from fits.optimise.result import Fit
 from fits.prediction.cross_validation import ModelScore, model_scores
-from fits.prediction.options import ComparisonOptions
+from fits.prediction.options import DEFAULT, ComparisonOptions
 from fits.progress import Progress
-from fits.sampling.posterior import Posterior, require_fits
+from fits.sampling.posterior import Posterior
 from layerjax._checks import require_kind
 from layerjax.compiling import programs_kept
 
@@ -59,7 +59,10 @@ class Comparison:
 
 
 def fits_of(candidates: Mapping[str, Fit | Posterior]) -> dict[str, Fit]:
-    """The fits among the candidates, and those of posteriors."""
+    """The fits among the candidates, and those of posteriors. ValueError for anything else."""
+    require_kind("candidates", candidates, Mapping)
+    for name, one in candidates.items():
+        require_kind(f"candidates[{name!r}]", one, Fit, Posterior)
     return {name: one.fit if isinstance(one, Posterior) else one for name, one in candidates.items()}
 
 
@@ -84,25 +87,23 @@ def compare(
         ValueError: fewer than two candidates, different data, different objectives, or joint fits; a part of one may be
             compared, but not with `refit`.
     """
-    require_fits(candidates)
+    fits = fits_of(candidates)
     require_kind("options", options, ComparisonOptions, None)
     require_switch("refit", refit)
     if len(candidates) < 2:
         raise ValueError(f"compare: {len(candidates)} candidate(s) given; at least 2 are needed")
-    fits, options = fits_of(candidates), options or ComparisonOptions()
+    options = options or DEFAULT
     _require_comparable(fits)
     rows = [ComparedFit(name, fit) for name, fit in fits.items()]
     if refit:
         scores = model_scores(fits, progress, options)
-        rows = [replace(row, model_score=scores[row.name]) for row in rows]
-        rows.sort(key=lambda row: -scores[row.name].elpd)
-        sorted_by = "elpd"
+        rows = [ComparedFit(name, fit, scores[name]) for name, fit in fits.items()]
+        sorted_by, ranks = "elpd", {name: -score.elpd for name, score in scores.items()}
     elif rows[0].fit.is_posterior:
-        rows.sort(key=lambda row: row.aic)
-        sorted_by = "aic"
+        sorted_by, ranks = "aic", {row.name: row.aic for row in rows}
     else:
-        rows.sort(key=lambda row: row.fit.chi_square)
-        sorted_by = "chi_square"
+        sorted_by, ranks = "chi_square", {row.name: row.fit.chi_square for row in rows}
+    rows.sort(key=lambda row: ranks[row.name])
     verdict = "\n".join(_verdict(rows[0], row, sorted_by, options) for row in rows[1:])
     return Comparison(tuple(rows), sorted_by, verdict, tuple(_notes(rows, options)), options)
 
@@ -116,10 +117,8 @@ def _require_comparable(fits: Mapping[str, Fit]) -> None:
         if not all(a.shape == b.shape and np.allclose(a, b, rtol=1e-9, atol=1e-12) for a, b in pairs):
             raise ValueError(f"compare: {first_name!r} and {name!r} were fitted to different data")
         if fit.problem.objective != first.problem.objective:
-            raise ValueError(
-                f"compare: {first_name!r} minimised {first.problem.objective!r}, {name!r} {fit.problem.objective!r}; "
-                "only fits of one objective can be compared"
-            )
+            words = f"{first_name!r} minimised {first.problem.objective!r}, {name!r} {fit.problem.objective!r}"
+            raise ValueError(f"compare: {words}; only fits of one objective can be compared")
 
 
 def _verdict(best: ComparedFit, other: ComparedFit, sorted_by: str, options: ComparisonOptions) -> str:
@@ -129,10 +128,8 @@ def _verdict(best: ComparedFit, other: ComparedFit, sorted_by: str, options: Com
     log-likelihood are then divided by its reduced chi-square (Burnham & Anderson 2002, Sec. 2.5, QAIC).
     """
     if sorted_by == "chi_square":
-        return (
-            f"{best.name} has a lower chi-square than {other.name}; without a likelihood the difference has no "
-            "significance."
-        )
+        words = "without a likelihood the difference has no significance"
+        return f"{best.name} has a lower chi-square than {other.name}; {words}."
     if (score := other.model_score) is not None:
         difference = 2.0 * score.clear_diff
         words = f"elpd difference {score.elpd_diff:.1f} ± {score.dse:.1f} by cross-validation"

@@ -1,15 +1,13 @@
 """Cross-validation, and which of several stacks predicts held-out data best: elpd differences, stacking weights.
 
-A fit is repeated without one group of measurements after the other, and predicts them.
-
-Measurements at one incidence resemble each other, so a single one that is held out is predicted well by its neighbours,
-whatever the stack. Groups are therefore whole incidences; of fewer than three, parts of every scan.
+A fit is repeated without one group of measurements after the other, and predicts them. A single measurement would be
+predicted well by its neighbours, whatever the stack. Groups are therefore whole incidences; of fewer than three, parts
+of every scan.
 """
 
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -22,18 +20,15 @@ from fits.data.scans import incidences, scans
 from fits.optimise.fit import refit
 from fits.optimise.result import Fit
 from fits.prediction.importance import Evidence, ImportanceDraws, evidence_of, posterior_draws
-from fits.prediction.options import ComparisonOptions
+from fits.prediction.options import DEFAULT, ComparisonOptions
 from fits.prediction.predict import posterior_predictive
-from fits.problem.discrepancy import project, size
-from fits.problem.noise import total_sigma
+from fits.problem.discrepancy import size
 from fits.problem.problem import Problem
 from fits.progress import Progress, given_progress, named
-from fits.sampling.initial import other_minima, vector_of
+from fits.sampling.initial import other_minima
+from fits.sampling.proposals import Density
 from layerjax._checks import require_count, require_kind, require_seed
 from layerjax.compiling import programs_kept
-
-if TYPE_CHECKING:
-    from fits.sampling.proposals import Density
 
 DRAWS = 128  # draws of the posterior that held-out data are predicted with at a time, see `ComparisonOptions`
 INFINITE_NOISE = 1e8  # noise with which a measurement does not influence a fit, in units of the largest measurement
@@ -45,10 +40,10 @@ STACKING_STEPS = 20_000  # steps of the expectation maximisation of stacking wei
 class CrossValidation:
     """Predictive densities of held-out measurements.
 
-    groups: names of what was held out together. rows: rows of each group among the used samples. log_density: log
-    predictive density of each measurement, (N, C), by the fit without its group; 0 for those in no group, whose plane
-    has too few to hold some out. converged: whether all of these fits converged. errors: standard error of the elpd of
-    each group, (G,), by the number of draws of the posterior.
+    groups: names of what was held out together. rows: of each group among the used samples. log_density: log predictive
+    density of each measurement, (N, C), by the fit without its group; 0 for those in no group, whose plane has too few
+    to hold some out. converged: whether all of these fits did. errors: standard error of the elpd of each group, (G,),
+    by the number of draws of the posterior.
     """
 
     groups: tuple[str, ...]
@@ -100,34 +95,29 @@ def cross_validate(
     """
     require_count("draws", draws, 2)
     require_seed(seed)
-    options = options or ComparisonOptions()
+    progress, options = given_progress(progress), options or DEFAULT
     groups, data = require_groups(fit, options), fit.problem.data.used()
     proposal = None if posterior is None else posterior.proposal(np.random.RandomState(seed), 2 * draws)
     density, errors, converged = np.zeros(data.values.shape), np.zeros(len(groups)), True
-    starts = [fit.vector, *(vector_of(fit, one) for one in other_minima(fit))]
     for number, (name, rows) in enumerate(groups.items()):
-        if progress is not None:
-            progress("cross-validation", number, len(groups), name)
-        record = _held_out(fit, data, rows, starts, draws, seed, options, proposal)
-        density[rows], errors[number] = record["log_density"], record["error"]
-        converged &= record["converged"]
-    if progress is not None:
-        progress("cross-validation", len(groups), len(groups), "")
+        progress("cross-validation", number, len(groups), name)
+        rest = refit(without(fit.problem, np.isin(np.arange(len(data)), rows)), fit.vector, *other_minima(fit))
+        density[rows], errors[number] = _predictive_density(rest, data, rows, draws, seed, options, proposal)
+        converged &= rest.converged
+    progress("cross-validation", len(groups), len(groups), "")
     return CrossValidation(tuple(groups), tuple(groups.values()), density, converged, errors)
 
 
-def _held_out(
-    fit: Fit,
+def _predictive_density(
+    rest: Fit,
     data: Measurements,
     rows: NDArray[np.int64],
-    starts: list[Floats],
     draws: int,
     seed: int,
     options: ComparisonOptions,
-    proposal: "Density | None",
-) -> dict[str, Any]:
-    """Log predictive density of these measurements by a fit without them, its error, and whether that converged."""
-    rest = refit(without(fit.problem, np.isin(np.arange(len(data)), rows)), *starts)
+    proposal: Density | None,
+) -> tuple[Floats, float]:
+    """Log predictive density of these rows of the data by a fit of the rest, and the standard error of its sum."""
     each, effective, error = np.empty((0, *data.values[rows].shape)), 0.0, math.inf
     while not len(each) or (error > options.monte_carlo_error and len(each) < options.most_draws):
         prediction = posterior_predictive(rest, data, draws=draws, seed=seed + len(each), proposal=proposal)
@@ -136,33 +126,24 @@ def _held_out(
         density = logsumexp(each, axis=0) - math.log(len(each))
         # how much each draw adds to the elpd, to first order
         error = float(np.std(np.sum(np.exp(each - density), axis=(1, 2))) / math.sqrt(effective))
-    return {"log_density": density, "error": error, "converged": rest.converged}
+    return density, error
 
 
 def require_groups(fit: Fit, options: ComparisonOptions | None = None) -> dict[str, NDArray[np.int64]]:
-    """Rows of a fit's measurements that are held out together, by name.
-
-    Raises:
-        ValueError: as `cross_validate`.
-    """
+    """Rows of a fit's measurements that are held out together, by name. ValueError as of `cross_validate`."""
     require_kind("fit", fit, Fit)
     require_kind("options", options, ComparisonOptions, None)
-    if not fit.is_posterior:
-        raise ValueError(
-            f"cross_validate: a fit of {fit.problem.objective!r} has no noise model and predicts no measurements"
-        )
-    fit.require_alone("cross_validate")
+    fit.require_posterior("cross_validate")
     if fit.problem.problems.get("") is not fit.problem:
         raise ValueError("cross_validate: it takes a fit of one measurement by itself, not a joint one")
-    groups = groups_of(fit.problem.data.used(), options)
+    groups = groups_of(fit.problem.data.used(), options or DEFAULT)
     if len(groups) < 2:
         raise ValueError("cross_validate: there is one incidence, and too few measurements to hold some of them out")
     return groups
 
 
-def groups_of(data: Measurements, options: ComparisonOptions | None = None) -> dict[str, NDArray[np.int64]]:
+def groups_of(data: Measurements, options: ComparisonOptions) -> dict[str, NDArray[np.int64]]:
     """Rows that are held out together, by name."""
-    options = options or ComparisonOptions()
     by_incidence = incidences(data)
     if len(by_incidence) >= options.min_incidences:
         return {one.label: one.rows for one in by_incidence}
@@ -172,10 +153,7 @@ def groups_of(data: Measurements, options: ComparisonOptions | None = None) -> d
 
 
 def without(problem: Problem, held_out: ArrayLike) -> Problem:
-    """The problem whose used samples `held_out`, (N,) bool, have no influence, as their noise is infinite.
-
-    Their residuals are 0; they still count as residuals.
-    """
+    """The problem whose used samples `held_out`, (N,) bool, have no influence, as their noise is infinite."""
     model, rows = problem.model, jnp.asarray(held_out)[:, None]
     infinite = INFINITE_NOISE * jnp.max(jnp.abs(model.values) + model.lowest)
     if model.process is not None:
@@ -185,12 +163,7 @@ def without(problem: Problem, held_out: ArrayLike) -> Problem:
         variance=jnp.where(rows, infinite**2, model.variance),
         lowest=jnp.where(rows, infinite, model.lowest),
     )
-    if model.process is not None and model.process.projection is not None:
-        parts = model.build(jnp.asarray(problem.start))
-        sigma = total_sigma(model.values, model.variance, parts.relative, parts.floor)
-        projection = project(model.process.weights, size(model.values, model.softness) / sigma)
-        model = replace(model, process=replace(model.process, projection=projection))
-    return problem.with_model(model)
+    return problem.with_model(model.with_projection())
 
 
 # ---- of several stacks ----
@@ -233,9 +206,7 @@ def model_scores(
 
 
 def out_of_sample(
-    fit: Fit,
-    progress: Progress | None = None,
-    options: ComparisonOptions | None = None,
+    fit: Fit, progress: Progress | None = None, options: ComparisonOptions | None = None
 ) -> tuple[CrossValidation, Evidence]:
     """Cross-validation and evidence of a fit, both by draws of its posterior."""
     require_groups(fit, options)
@@ -250,7 +221,7 @@ def rank_models(
     options: ComparisonOptions | None = None,
 ) -> dict[str, ModelScore]:
     """Score fits of the same data by their cross-validation and evidence, side by side."""
-    options = options or ComparisonOptions()
+    options = options or DEFAULT
     best = max(held_out.values(), key=lambda one: one.elpd)
     weights = stacking(np.stack([one.log_density.ravel() for one in held_out.values()]))
     probabilities = softmax(np.array([evidences[name].log_evidence for name in held_out]))

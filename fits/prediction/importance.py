@@ -1,11 +1,11 @@
 """Importance sampling of the posterior of a fit: weighted draws without a chain, and the evidence.
 
 Proposals are Laplace's approximations about the minima of the fit, and where these do not suffice, mixtures along its
-ridges. The Pareto k of the largest weights says how well the draws
-represent the posterior (Vehtari, Simpson, Gelman, Yao & Gabry 2024, JMLR 25, 72). While weights are too uneven, a
-mixture is fitted to the weighted draws, and drawn from as well (Cappe, Guillin, Marin & Robert 2004, J. Comput. Graph.
-Stat. 13, 907); the draws of all proposals are weighted as those of their mixture (Cornuet, Marin, Mira & Robert 2012,
-Scand. J. Stat. 39, 798). Their mean weight is the evidence, for any proposal.
+ridges. The Pareto k of the largest weights says how well the draws represent the posterior (Vehtari, Simpson, Gelman,
+Yao & Gabry 2024, JMLR 25, 72). While weights are too uneven, a mixture is fitted to the weighted draws, and drawn from
+as well (Cappe, Guillin, Marin & Robert 2004, J. Comput. Graph. Stat. 13, 907); the draws of all proposals are weighted
+as those of their mixture (Cornuet, Marin, Mira & Robert 2012, Scand. J. Stat. 39, 798). Their mean weight is the
+evidence, for any proposal.
 """
 
 from dataclasses import dataclass
@@ -16,30 +16,23 @@ from scipy.special import logsumexp
 
 from fits.data.geometry import Floats
 from fits.optimise.result import Fit
-from fits.prediction.options import ComparisonOptions
+from fits.prediction.options import DEFAULT
 from fits.sampling.initial import initial_mixture, log_posteriors
 from fits.sampling.proposals import Density, FittedProposal
 from layerjax._checks import require_count, require_kind, require_seed
 from layerjax._numerics import broadcasting
 
-# Pareto k above which a part of the posterior may be missing; below it the draws suffice
-MAX_PARETO_K = ComparisonOptions().max_pareto_k
-
-FINITE_VARIANCE, ROUNDS = 0.5, 3
-"""Pareto k below which the variance of weights is finite, and how many mixtures are fitted to reach it."""
-
-MIN_EFFECTIVE_DRAWS = 50
-"""Effective sample size below which another proposal is tried, and to which weights are tempered before a mixture is
-fitted to them."""
-
+MAX_PARETO_K = DEFAULT.max_pareto_k  # above it a part of the posterior may be missing
+FINITE_VARIANCE = 0.5  # Pareto k below which the variance of weights is finite
+ROUNDS = 3  # how many mixtures are fitted to reach it
+MIN_EFFECTIVE_DRAWS = 50  # below it another proposal is tried; weights are tempered to it before a mixture is fitted
 DRAWS = 1000  # draws of each proposal for an evidence
 BATCH = 50  # draws that a core evaluates at a time: however many there are, one program serves
 
 
 @dataclass(frozen=True, eq=False)
 class ImportanceDraws:
-    """Unconstrained draws of proposals, (D, P), and their log weights, posterior / proposal, (D,); pareto_k: Pareto k
-    of the weights."""
+    """Unconstrained draws, (D, P), log weights posterior / proposal, (D,), and the Pareto k of the weights."""
 
     positions: Floats
     log_weights: Floats
@@ -56,10 +49,8 @@ class ImportanceDraws:
         return self.pareto_k < max_pareto_k and self.effective_sample_size >= MIN_EFFECTIVE_DRAWS
 
     def resample(self, generator: np.random.RandomState, count: int) -> Floats:
-        """(count, P) draws of the posterior, unconstrained: the more even the weights, the fewer occur twice.
-
-        Unreliable weights are tempered: draws then spread more widely than the posterior, rather than repeat a few.
-        """
+        """(count, P) draws of the posterior, unconstrained. Unreliable weights are tempered: draws then spread more
+        widely than the posterior, rather than repeat a few."""
         weights = self.log_weights if self.pareto_k < MAX_PARETO_K else _tempered(self.log_weights)
         return self.positions[_resample(weights, generator, count)]
 
@@ -81,9 +72,8 @@ def importance_draws(
 ) -> ImportanceDraws:
     """Draw as many of each of several proposals, until their weights suffice; the fit is of a likelihood.
 
-    max_pareto_k: the Pareto k that suffices.
-    along_ridge: begin with mixtures along the ridges of the fit's minima, if they have one; that takes some hundred
-        Jacobians. Otherwise they are used if neither approximations about the minima nor `proposal` suffice.
+    max_pareto_k: that suffices. along_ridge: begin with mixtures along the ridges of the fit's minima, which takes some
+    hundred Jacobians; otherwise they are used if neither approximations about the minima nor `proposal` suffice.
     proposal: an approximation of a posterior similar to the fit's.
     """
     import arviz
@@ -152,8 +142,8 @@ def _tempered(log_weights: Floats) -> Floats:
 
 @dataclass(frozen=True)
 class Evidence:
-    """log_evidence: natural logarithm, with data in 1/sr. error: its standard error. pareto_k: Pareto k of the largest
-    importance weights: above 0.7 the approximation misses a part of the posterior, and the error is too small."""
+    """log_evidence: natural logarithm, with data in 1/sr. error: its standard error. pareto_k: of the importance
+    weights: above 0.7 the approximation misses a part of the posterior, and the error is too small."""
 
     log_evidence: float
     error: float
@@ -182,9 +172,7 @@ def evidence(fit: Fit, *, draws: int = DRAWS, seed: int = 0) -> Evidence:
     require_kind("fit", fit, Fit)
     require_count("draws", draws, 2)
     require_seed(seed)
-    if not fit.is_posterior:
-        raise ValueError(f"evidence: a fit of {fit.problem.objective!r} has none, it minimised no likelihood")
-    fit.require_alone("evidence")
+    fit.require_posterior("evidence")
     return evidence_of(posterior_draws(fit, draws, seed))
 
 

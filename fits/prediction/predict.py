@@ -9,7 +9,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
 import jax
 import jax.numpy as jnp
@@ -32,23 +32,23 @@ from fits.problem.problem import polar_angles
 from fits.problem.simulate import require_visible
 from fits.sampling.initial import normal_draws
 from fits.sampling.posterior import Posterior
+from fits.sampling.proposals import Density
 from layerjax._checks import in_short, require_count, require_kind, require_number, require_seed
 from layerjax.compiling import programs_kept
 
-if TYPE_CHECKING:
-    from fits.sampling.proposals import Density
-
-LEVELS = (0.025, 0.25, 0.5, 0.75, 0.975)
-"""Quantiles of a `Summary`: the ends of the central 50 % and 95 % intervals, and the median."""
-
+LEVELS = (
+    0.025,
+    0.25,
+    0.5,
+    0.75,
+    0.975,
+)  # quantiles of a `Summary`: ends of the central 50 % and 95 % intervals, median
 COVERAGES = (0.5, 0.95)  # central intervals whose coverage is scored
 DRAWS = 256  # draws of the posterior that a prediction is made with
 MIN_PROPOSALS = 400  # the fewest weighted draws that those of a fit's posterior are resampled from
 DRAWS_PER_VECTOR = 8  # values that are drawn of the distribution of each draw of the posterior, for means and quantiles
 BISECTIONS = 50  # halvings of the interval that a quantile of the mixture lies in
-
-# the least standard deviation of the discrepancy, where the data determine it: its distribution keeps a density
-SMALLEST_SD = 1e-12
+SMALLEST_SD = 1e-12  # of the discrepancy, where the data determine it: its distribution keeps a density
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,11 +70,10 @@ class Prediction:
         values: the stack's own value for each of D draws of the posterior, (D, M, C), in 1/sr.
         means, scales: location and scale of a measurement for each draw, (D, M, C), in 1/sr; with a discrepancy, of its
             `logarithm`.
-        softness: softness of that logarithm, (M, C) or (D, M, C), in 1/sr; None where values themselves are meant.
-        discrepancy_sd: standard deviation of the discrepancy about `means`, (D, M, C), of the logarithm; None without a
-            discrepancy.
-        degrees_of_freedom: degrees of freedom of Student's t; infinite for a Gaussian.
-        seed: seed of the draws that `bsdf` and `predictive` summarise.
+        softness: of that logarithm, (M, C) or (D, M, C), in 1/sr; None where values themselves are meant.
+        discrepancy_sd: standard deviation of the discrepancy about `means`, (D, M, C), of the logarithm; None without.
+        degrees_of_freedom: of Student's t; infinite for a Gaussian.
+        seed: of the draws that `bsdf` and `predictive` summarise.
         pareto_k: Pareto k of the importance weights that the draws of a fit's posterior are resampled by (see
             `fits.evidence`); NaN for draws of a chain.
         effective_draws: effective sample size of the D draws of the posterior.
@@ -203,9 +202,8 @@ class Scores:
     """Scores of predicted measurements.
 
     count: measurements times channels. median_error, p95_error: median and 95th percentile of
-    |prediction / measurement - 1|, the prediction being the median; model_error: the median for the stack's own value.
-    coverage: share of measurements in the central 50 % and 95 % intervals. elpd: mean log predictive density of a
-    measurement.
+    |prediction / measurement - 1|, by the median prediction. model_error: the median of it by the stack's own value.
+    coverage: share of measurements in the central 50 % and 95 % intervals. elpd: mean log predictive density of one.
     """
 
     count: int
@@ -225,8 +223,7 @@ def scores(prediction: Prediction, measurements: Measurements, rows: NDArray[np.
     require_kind("prediction", prediction, Prediction)
     require_kind("measurements", measurements, Measurements, fix=TO_HAVE_THEM)
     used = measurements.used()
-    directions = (used.wi, prediction.wi), (used.wo, prediction.wo)
-    if not all(len(own) == len(theirs) and np.allclose(own, theirs) for own, theirs in directions):
+    if len(used) != len(prediction.wi) or not np.allclose([used.wi, used.wo], [prediction.wi, prediction.wo]):
         raise ValueError("scores: the measurements have other directions than the prediction")
     chosen = np.ones(len(used), bool) if rows is None else rows
     if not chosen.any():
@@ -253,11 +250,7 @@ class Predictor(Protocol):
 
 @programs_kept()
 def predict(
-    fitted: Fit | Posterior | Predictor,
-    at: Geometry | Measurements,
-    *,
-    draws: int = DRAWS,
-    seed: int = 0,
+    fitted: Fit | Posterior | Predictor, at: Geometry | Measurements, *, draws: int = DRAWS, seed: int = 0
 ) -> Prediction:
     """Predict the BSDF along other directions, and new measurements of it.
 
@@ -286,12 +279,7 @@ def predict(
 
 
 def posterior_predictive(
-    fitted: Fit | Posterior,
-    at: Geometry | Measurements,
-    *,
-    draws: int,
-    seed: int,
-    proposal: "Density | None" = None,
+    fitted: Fit | Posterior, at: Geometry | Measurements, *, draws: int, seed: int, proposal: Density | None = None
 ) -> Prediction:
     """`predict` for one fit; proposal: an approximation of its posterior (see `importance_draws`), if there is one."""
     fit = fitted.fit if isinstance(fitted, Posterior) else fitted
@@ -326,9 +314,8 @@ def _measurements(fit: Fit, at: Geometry | Measurements) -> Measurements:
     channels = fit.problem.data.channels
     if isinstance(at, Measurements):
         if len(at.channels) != len(channels):
-            raise ValueError(
-                f"predict: the measurements have the channels {', '.join(at.channels)}, the fit {', '.join(channels)}"
-            )
+            own, theirs = ", ".join(channels), ", ".join(at.channels)
+            raise ValueError(f"predict: the measurements have the channels {theirs}, the fit {own}")
         return at.used()
     require_visible("predict", fit.problem.stack, light=at.wi, viewer=at.wo)
     values = np.zeros((len(at), len(channels)))
@@ -336,7 +323,7 @@ def _measurements(fit: Fit, at: Geometry | Measurements) -> Measurements:
 
 
 def _posterior_draws(
-    fitted: Fit | Posterior, draws: int, generator: np.random.Generator, proposal: "Density | None" = None
+    fitted: Fit | Posterior, draws: int, generator: np.random.Generator, proposal: Density | None = None
 ) -> tuple[Floats, float, float]:
     """Draws (D, P) of the posterior, the Pareto k of their weights, and their effective sample size."""
     if isinstance(fitted, Posterior):
@@ -394,8 +381,7 @@ def _softness(fit: Fit, additive: Floats) -> Floats:
 
 
 def _stated_sigma(fit: Fit, values: Floats, sigma: Floats | None) -> Floats:
-    """The measurements' stated sigma, (M, C), if there is one; otherwise that of the fitted data, relative to
-    the model."""
+    """The measurements' stated sigma, (M, C), if there is one; else that of the fitted data, relative to the model."""
     used = fit.problem.data.used()
     if used.sigma is None or not fit.problem.noise.use_sigma:
         return np.zeros(values.shape[1:])

@@ -21,24 +21,16 @@ from fits.data.geometry import TANGENT_COSINE, Floats
 from fits.problem.parameters import is_free
 from layerjax.mixture import stacks_of
 
-MOST_RINGS, MOST_OF_TWO = 8, 4
-"""The most rings of a cone, and of each of two."""
-
-PER_RING, AT_NONE, BOTH_WIDE = 0.41, 0.16, 1.2
-"""Radius of a disc in widths of a lobe that n rings resolve: the first times n, less the second; the radius of two
-cones together counts more than that of one by the third."""
-
-SHIFT = 1e-3
-"""Relative difference between a mean over a cone and its middle that does not count."""
-
-STEEPEST, LEAST = np.radians(85.0), 1e-6
-"""The steepest angle of a half vector, and the least squared sum of two directions."""
-
-SOONER = 0.6
-"""Share of the distance from the peak that counts for how steep a lobe is beside its own value."""
-
-PASSING = 2.0
-"""Degrees by which glass has to tilt to turn light that passes by one; half as many turn what it reflects."""
+MOST_RINGS, MOST_OF_TWO = 8, 4  # rings of a cone, and of each of two
+PER_RING, AT_NONE = (
+    0.41,
+    0.16,
+)  # radius of a disc in widths of a lobe that n rings resolve: the first times n, less that
+BOTH_WIDE = 1.2  # factor by which the radius of two cones together counts more than that of one
+SHIFT = 1e-3  # relative difference between a mean over a cone and its middle that does not count
+STEEPEST, LEAST = np.radians(85.0), 1e-6  # angle of a half vector at most; squared sum of two directions at least
+SOONER = 0.6  # share of the distance from the peak that counts for how steep a lobe is beside its own value
+PASSING = 2.0  # degrees by which glass has to tilt to turn light that passes by one; half as many turn a reflection
 
 LATTICE = {1: (4, 1), 2: (25, 7), 3: (50, 9), 4: (85, 13)}
 """Of two cones of n rings each: pairs of azimuths, and how many steps the second takes where the first takes one. The
@@ -56,13 +48,9 @@ def ring_counts(
     tilted flakes) counts as if it were met at its peak, light that passes as narrow. Cosines change by r^2 / (2 cos)^2.
     In the tangent plane there is nothing to take the mean of.
 
-    Args:
-        source, detector: full angles of the cones, degrees.
-        stack: of free parameters the end counts at which lobes are narrowest; of anything but stacks one ring is taken
-            everywhere, or `most`.
-        wi, wo: (N, 3).
-        tilt: degrees by which the sample may be tilted, besides.
-        most: rings; None: as many as are ever taken.
+    source, detector: full angles of the cones, degrees. stack: of free parameters the end counts at which lobes are
+    narrowest; of anything but stacks one ring is taken everywhere, or `most`. tilt: degrees by which the sample may be
+    tilted, besides. most: rings; None: as many as are ever taken.
     """
     both = source > 0.0 and detector > 0.0
     seen = np.minimum(np.abs(wi[:, 2]), np.abs(wo[:, 2])) > TANGENT_COSINE
@@ -82,9 +70,8 @@ def ring_counts(
     reflected = np.sqrt(square) * np.maximum(1.0 / np.hypot(SOONER * nearest, facets), 1.0 / others)
     radius = np.where(passing, PASSING * np.hypot(*radii) / min(facets, others), reflected)
     rings = np.ceil((radius * (BOTH_WIDE if both else 1.0) + AT_NONE) / PER_RING - 1e-9)
-    return np.where(matters, np.clip(rings, 1, min(most or MOST_RINGS, MOST_OF_TWO if both else MOST_RINGS)), 0).astype(
-        int
-    )
+    most = min(most or MOST_RINGS, MOST_OF_TWO if both else MOST_RINGS)
+    return np.where(matters, np.clip(rings, 1, most), 0).astype(int)
 
 
 def _narrowest(material: lj.Stack | lj.Mixture) -> tuple[float, float]:

@@ -20,8 +20,7 @@ from layerjax.compiling import compiler_options, is_outermost
 T = TypeVar("T")
 U = TypeVar("U")
 
-FULL = 0.5
-"""Share of the maps that a process may have."""
+FULL = 0.5  # share of the maps that a process may have
 
 
 class Static:
@@ -65,30 +64,27 @@ class _Limit:
     limited: Any = None
 
 
+# threadpoolctl 3.7 and later ignores, without a word, all threads but the first that set a limit, until this is called
+_free_limits = getattr(OpenBLASController, "clear_controlling_thread", lambda force: None)
+
+
 @contextmanager
 def one_thread() -> Iterator[None]:
     """LAPACK by one thread: those of a small matrix wait for each other busily, a hundredfold beside other work."""
-    _count(1)
+    with _Limit.lock:
+        if _Limit.calls == 0:
+            _free_limits(force=True)
+            _Limit.limited = _libraries().limit(limits=1)
+        _Limit.calls += 1
     try:
         yield
     finally:
-        _count(-1)
-
-
-def _count(change: int) -> None:
-    with _Limit.lock:
-        before, _Limit.calls = _Limit.calls, _Limit.calls + change
-        if before and _Limit.calls:
-            return
-        if hasattr(OpenBLASController, "clear_controlling_thread"):
-            # threadpoolctl 3.7 and later ignores, without a word, all threads but the first that set a limit
-            OpenBLASController.clear_controlling_thread(force=True)
-        if _Limit.calls:
-            _Limit.limited = _libraries().limit(limits=1)
-        else:
-            _Limit.limited.restore_original_limits()
-            if hasattr(OpenBLASController, "clear_controlling_thread"):
-                OpenBLASController.clear_controlling_thread(force=True)
+        with _Limit.lock:
+            _Limit.calls -= 1
+            if _Limit.calls == 0:
+                _free_limits(force=True)
+                _Limit.limited.restore_original_limits()
+                _free_limits(force=True)
 
 
 @cache
@@ -115,10 +111,8 @@ def make_room() -> None:
 
 
 def devices_of_cores() -> None:
-    """Make each core a device of JAX, over which layerjax splits large batches; before the first computation.
-
-    Left as it is where that is too late, or the user has set devices.
-    """
+    """Make each core a device of JAX, over which layerjax splits large batches, if it is not too late for that and the
+    user has not set devices."""
     if "xla_force_host_platform_device_count" in os.environ.get("XLA_FLAGS", ""):
         return
     if jax.config.values["jax_num_cpu_devices"] < 1:
@@ -140,10 +134,8 @@ def on_all_cores(call: Callable[[T], U], items: Iterable[T]) -> list[U]:
 def in_shares(
     call: Callable[[NDArray[Any]], Any], rows: NDArray[Any], share: int, compiled: bool = False
 ) -> list[NDArray[Any]]:
-    """The arrays that call(rows) gives, by so many rows at a time, on all cores: a program keeps but one busy.
-
-    The last share is padded, so that all have one program; unless it is compiled, the first runs alone and does that.
-    """
+    """The arrays that call(rows) gives, by so many rows at a time, on all cores; the last share is padded, so that all
+    have one program. Unless that is compiled, the first runs alone and does it."""
 
     def of(first: int) -> list[NDArray[Any]]:
         part = rows[first : first + share]

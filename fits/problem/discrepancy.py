@@ -34,35 +34,20 @@ from numpy.typing import ArrayLike, NDArray
 from fits.data.geometry import Floats
 from fits.problem.parameters import Free, LogNormal, Normal, require_number_or_free
 
-LONGEST = 40.0
-"""Degrees of a length scale whose prior is not given, at most: what is correlated farther would take the place of the
-stack's level."""
-
-LINEAR_BELOW, LEAST_SOFTNESS = 4.0, 1e-6
-"""Standard deviations of the additive noise below which the logarithm is linear; and what that is at least, of the
-median measurement, where nothing is said of additive noise."""
-
-GRAZING = 85.0
-"""Degrees from which the discrepancy grows no more."""
-
-SHORTEST, LEAST_SHORTEST, REACHES = 5.0, 0.05, 16
-"""Shortest length scale in degrees that inducing points carry where measurements reach far, and at least; and how many
-of it there are across measurements that do not reach far."""
-
-FEWEST_NODES, SOME_NODES, MOST_NODES, A_NODE, MOST_ROWS = 80, 160, 250, 50, 400
-"""Inducing points at most: the first with many channels, the third with many measurements, every so many
-of which (the fourth) add one; and the most rows of the matrix, points times channels."""
-
-LOST, LONGER, CANDIDATES = 0.02, 1.25, 4000
-"""Where the points leave more of the variance at a measurement, the shortest length scale grows by the second; chosen
-among at most so many places."""
-
-TYPICAL = 2.0
-"""Measurements are regressed on the points with so many times the shortest length scale."""
-
+LONGEST = 40.0  # degrees: a longer length scale, if its prior is not given, would take the place of the stack's level
+LINEAR_BELOW = 4.0  # standard deviations of the additive noise: the logarithm is linear below
+LEAST_SOFTNESS = 1e-6  # of the median measurement: it is linear below, where nothing is said of additive noise
+GRAZING = 85.0  # degrees from which the discrepancy grows no more
+SHORTEST, LEAST_SHORTEST = 5.0, 0.05  # degrees of the shortest length scale that inducing points carry, and at least
+REACHES = 16  # so many of it there are across measurements that do not reach far
+FEWEST_NODES, MOST_NODES = 80, 250  # inducing points at most, with many channels, and with many measurements
+SOME_NODES, A_NODE = 160, 50  # with few measurements, every so many of which add one
+MOST_ROWS = 400  # of the matrix: points times channels
+LOST, LONGER = 0.02, 1.25  # where points leave more of the variance, the shortest length scale grows by the second
+CANDIDATES = 4000  # places that points are chosen among, at most
+TYPICAL = 2.0  # measurements are regressed on the points with so many times the shortest length scale
 JITTER, ROUNDING, TINY = 1e-8, 1e-10, 1e-9
-LEAST_INFORMATION = 1e-6
-"""Of the information about a parameter of the process: what is kept of its smallest eigenvalue."""
+LEAST_INFORMATION = 1e-6  # about a parameter of the process: what is kept of its smallest eigenvalue
 
 
 # ---- its parameters ----
@@ -78,7 +63,7 @@ class Correlation(NamedTuple):
     channel_correlation: Any
 
 
-ANGLES = (0.1, 360.0)
+ANGLES = (0.1, 360.0)  # degrees of length scales
 RANGES = {"amplitude": (1e-6, 1.0), "grazing_exponent": (0.0, 2.0), "channel_correlation": (0.0, 1.0)}
 
 

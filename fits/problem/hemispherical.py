@@ -14,19 +14,14 @@ from layerjax._shapes import require_single
 from layerjax.quadrature import gauss_legendre
 from layerjax.stack import simplify
 
-DIFFUSE = 12
-"""Directions, on either side, that diffuse light comes from."""
+DIFFUSE = 12  # directions, on either side, that diffuse light comes from
 
 
 class Totalling(eqx.Module):
     """(stack, wi, wo) -> shares of light (N, C), in the place of a transport's values.
 
-    Attributes:
-        transport: a layerjax transport, or "auto".
-        kinds: of the N measurements.
-        solved_rows: those with different lights, which are solved for.
-        light: the place among these of each measurement's.
-        spheres: that read them; None: shares of the sample alone.
+    kinds: of the N measurements. solved_rows: those with different lights, which are solved for. light: the place among
+    these of each measurement's. spheres: that read them; None: shares of the sample alone.
     """
 
     transport: Any = eqx.field(static=True)
@@ -41,9 +36,8 @@ class Totalling(eqx.Module):
         if not isinstance(transport, lj.Transport) and transport != "auto":
             raise ValueError(f"transport is {transport!r}; totals take a layerjax transport, or 'auto'")
         _, solved_rows, light = np.unique(totals.wi, axis=0, return_index=True, return_inverse=True)
-        return cls(
-            transport, totals.kinds, tuple(solved_rows.tolist()), tuple(np.ravel(light).tolist()), totals.spheres
-        )
+        rows, places = (tuple(np.ravel(one).tolist()) for one in (solved_rows, light))
+        return cls(transport, totals.kinds, rows, places, totals.spheres)
 
     def __call__(self, stack: lj.Stack | lj.Mixture, wi: Array, wo: Array) -> Array:
         require_single(stack, "inference")
@@ -82,7 +76,6 @@ def _unscattered(stack: lj.Stack | lj.Mixture, lights: Array, transport: Any) ->
     unscattered = lj.unscattered(stack, lights)
     if stack.base is not None or not any(isinstance(layer, lj.Interface) for layer in stack.layers):
         return unscattered
-    absorbing = [
-        lj.Medium(layer.thickness, 0.0) if isinstance(layer, lj.Medium) else layer for layer in simplify(stack).layers
-    ]
+    layers = simplify(stack).layers
+    absorbing = [lj.Medium(one.thickness, 0.0) if isinstance(one, lj.Medium) else one for one in layers]
     return unscattered + lj.albedo(lj.Stack(absorbing), lights, transport)[1]

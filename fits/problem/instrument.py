@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -22,11 +23,8 @@ from fits.problem.parameters import Free, LogNormal, require_number_or_free
 from layerjax._checks import require_count, require_number
 from layerjax.transport.known_directions import KnownDirections, known_directions
 
-WIDEST, MOST_TILT, GAIN_SPREADS = 30.0, 10.0, (1e-4, 1.0)
-"""Degrees of a cone, degrees that a sample may be tilted, and relative standard deviations of gains."""
-
-GAINS_END = 6.0
-"""Standard deviations of their logarithm at which gains are bounded."""
+WIDEST, MOST_TILT = 30.0, 10.0  # degrees of a cone, and of a sample's tilt
+GAIN_SPREADS, GAINS_END = (1e-4, 1.0), 6.0  # relative standard deviations of gains; so many of them bound a gain
 
 
 @dataclass(frozen=True)
@@ -34,17 +32,14 @@ class Instrument:
     """An instrument by which measurements were taken. Angles in degrees.
 
     source_aperture, detector_aperture: full angles of the cones, in [0, 30]; a measurement is the mean over them, which
-    costs four times as much where a lobe may be narrow, more where one is narrower than the cones, and nothing
-    elsewhere.
-    tilt: by how much the sample's normal is tilted towards the mirror side of the plane of incidence, in [-10, 10]; a
-    number, `Free`, or None for 0.
+    costs four times as much where a lobe may be narrow, more where one is narrower than the cones.
+    tilt: of the sample's normal towards the mirror side of the plane of incidence, in [-10, 10], or `Free`; None: 0.
     gain_sd: relative standard deviation, in [1e-4, 1], of a factor of its own that every polar angle of the
     light has, at all azimuths, beside the common scale, with a log-normal prior about 1 that they share; None: none.
     floor: of the noise, in 1/sr: as `Noise.floor`, in whose place it stands.
     rings: of rays that stand for a cone where a lobe is narrowest, at most, in [1, 8]; n of them keep the error below a
     thousandth of the peak where the cones together are as wide as 0.64 n - 0.25 lobes at half maximum (two cones: a
-    sixth less, and at most 4). None: as many as the narrowest lobe asks for that the bounds of the stack allow; for a
-    fit, as many as the lobe asks for that it finds.
+    sixth less, and at most 4). None: as many as the narrowest lobe within the bounds, or that a fit finds, asks for.
     """
 
     source_aperture: float = 0.0
@@ -74,11 +69,11 @@ class Setting(NamedTuple):
 
 
 class Optics(eqx.Module):
-    """Pairs of directions that stand for N measurements: K of them, each a share of a measurement.
+    """K pairs of directions, each a share of one of N measurements.
 
     wi, wo: (K, 3). row: (K,), the measurement; share: (K,), of it; None where each is one of its own. forward: (K, 2),
-    the horizontal unit vector towards the mirror side; None where it is known how the sample is tilted. incidence:
-    (N,), whose gain it has; None where there are none.
+    the horizontal unit vector towards the mirror side; None where the tilt is known. incidence: (N,), whose gain a
+    measurement has; None without gains.
     """
 
     wi: Array
@@ -119,8 +114,8 @@ def optics_of(
 ) -> Optics:
     """What stands for measurements along these directions, (N, 3) each, of a stack, `Free` or not.
 
-    incidences: polar angles of the light, (K,), that have a gain. follow: known directions are of use. other: with
-    a ring more for each cone, or one less where there is none: the difference tells the error.
+    incidences: polar angles of the light, (K,), that have a gain. follow: known directions are of use. other: with a
+    ring more or less for each cone: the difference tells the error.
     """
     incidence = None if instrument.gain_sd is None else _which(wi, incidences)
     tilt = instrument.tilt
@@ -138,19 +133,9 @@ def optics_of(
         pairs, row, share = _cones(widths, wi, wo, counts)
         if forward is not None:
             forward = forward[row]  # the sample is tilted one way, whichever ray of a cone it meets
-
-    def array(part: Any) -> Array | None:
-        return None if part is None else jnp.asarray(part)
-
-    return Optics(
-        wi=jnp.asarray(pairs[0]),
-        wo=jnp.asarray(pairs[1]),
-        row=array(row),
-        share=array(share),
-        forward=array(forward),
-        incidence=array(incidence),
-        known=known_directions(*pairs) if follow and forward is None else None,
-    )
+    known = known_directions(*pairs) if follow and forward is None else None
+    arrays: tuple[Any, Any, Any, Any, Any, Any] = jax.tree.map(jnp.asarray, (*pairs, row, share, forward, incidence))
+    return Optics(*arrays, known)
 
 
 def rings_for(instrument: Instrument, setting: Setting, stack: Any, wi: Floats, wo: Floats) -> int:

@@ -7,6 +7,8 @@ that of several.
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
+from itertools import pairwise
 from typing import Any, Literal, NamedTuple, cast
 
 import equinox as eqx
@@ -18,7 +20,7 @@ from numpy.typing import NDArray
 
 import layerjax as lj
 from fits.names import Objective
-from fits.problem.discrepancy import Correlation, Process, Whitened, logarithm, size
+from fits.problem.discrepancy import Correlation, Process, Whitened, logarithm, project, size
 from fits.problem.instrument import Optics, Setting
 from fits.problem.noise import (
     Tails,
@@ -26,7 +28,6 @@ from fits.problem.noise import (
     level_residual,
     log_density,
     named_residual,
-    sigma_residual,
     tail_residual,
     total_sigma,
 )
@@ -39,21 +40,20 @@ Transport = lj.Transport | Literal["auto"] | Callable[[Any, Array, Array], Array
 """How the values are computed: a layerjax transport, `"auto"`, or any callable in the place of one.
 
 A callable takes the stack with numbers in place of its free parameters, and unit directions wi and wo, (N, 3) each,
-and returns the BSDF in 1/sr, (N, C). JAX traces and differentiates it, and it must be hashable: functions, `jax.jit` of
-them, `functools.partial`, equinox modules and most objects with `__call__` are.
+and returns the BSDF in 1/sr, (N, C). JAX traces and differentiates it, and it must be hashable, as functions are.
 """
 
 Side = Literal["all", "reflection"]
 
 Step = tuple[Array, Array] | None
-"""Of the first step towards a fit of levels of noise: a scale of it, (N, C), that stands in the place of sigma where it
-is finite, and the share of the model discrepancy that counts; None: all is free."""
+"""What stands in the place of sigma, (N, C), where it is finite, and the share of the model discrepancy that counts, on
+the way to a fit of levels of noise; None: all is free."""
 
 
 class Parts(NamedTuple):
     """What a vector of parameters stands for: the stack, the common scale, and the levels of the noise model.
 
-    instrument: None where there is nothing to say of it. correlation: of the model discrepancy, None without.
+    instrument, correlation: None without an instrument, or a model discrepancy.
     """
 
     stack: Any
@@ -69,23 +69,12 @@ class Model(eqx.Module):
 
     What ends with `_at` takes what the vector predicts, (N, C), beside it, so that nothing is computed twice.
 
-    Attributes:
-        template: the stack, scale and noise levels without their free parameters.
-        box: bounds and priors of the P parameters.
-        wi, wo: directions of the N samples, (N, 3).
-        values: BSDF in C channels, (N, C), in 1/sr.
-        variance: the measurement's own, (N, C), in 1/sr^2.
-        lowest: what sigma cannot fall below, (N, C), in 1/sr.
-        degrees_of_freedom: of Student-t tails.
-        transport: how the values are computed.
-        side: "reflection" if all directions lie above.
-        known: what is known of the directions beforehand.
-        optics: how an instrument sees them, None for exact directions.
-        process: the model discrepancy, None without.
-        softness: of its `logarithm`, (N, C), in 1/sr; None without.
-        objective, tails: see `Problem` and `Noise`.
-        varying: whether sigma depends on the parameters.
-        moving: so many of them come first, on which predictions depend; the others are those of the noise.
+    template: of `Parts`. box: bounds and priors of the P parameters. wi, wo: directions of the N samples, (N, 3).
+    values: BSDF, (N, C), in 1/sr. variance: the measurement's own, (N, C), in 1/sr^2. lowest: what sigma cannot fall
+    below, (N, C), in 1/sr. known: what is known of the directions beforehand. optics: how an instrument sees them, None
+    for exact directions. process: the model discrepancy, with the softness of its `logarithm`, (N, C), in 1/sr; None
+    without. side: "reflection" if all directions lie above. varying: whether sigma depends on the parameters. moving:
+    so many of them come first, on which predictions depend; the others are those of the noise.
     """
 
     template: Template
@@ -132,6 +121,19 @@ class Model(eqx.Module):
         vector = self.box.constrain(u)
         total = self.log_likelihood(vector) + self.box.log_prior(vector) + self.box.log_determinant(u)
         return jnp.where(jnp.isfinite(total), total, -jnp.inf)
+
+    def with_projection(self) -> "Model":
+        """The model with what its measurements say of inducing points, where that depends on no parameter."""
+        if self.process is None or self.varying:
+            return self
+        parts = self.build(self.box.low)
+        # by numpy, as JAX would compile each step
+        values, variance, relative, floor, softness, weights = (
+            np.asarray(one, float)
+            for one in (self.values, self.variance, parts.relative, parts.floor, self.softness, self.process.weights)
+        )
+        projection = project(weights, size(values, softness) / total_sigma(values, variance, relative, floor))
+        return replace(self, process=replace(self.process, projection=jax.tree.map(jnp.asarray, projection)))
 
     @property
     def places(self) -> tuple[tuple[int, ...], ...]:
@@ -276,7 +278,7 @@ class Model(eqx.Module):
         if self.objective != "likelihood":
             return (self._named(predicted),)
         sigma = self._noise_at(vector, predicted, step)
-        levels = [sigma_residual(sigma, self.lowest)] if self.varying else []
+        levels = [level_residual(jnp.log(jnp.maximum(sigma / self.lowest, 1.0)))] if self.varying else []
         if self.process is None:
             data = tail_residual((predicted - self.values) / sigma, self.tails, self.degrees_of_freedom)
         else:
@@ -313,24 +315,18 @@ def _(primals: tuple[Array], tangents: tuple[Array], *, model: Model) -> tuple[A
 class JointModel(eqx.Module):
     """Of several data sets, one after the other, (N, 1), the same functions as of one: the product of their densities.
 
-    Attributes:
-        parts: the densities of the data sets.
-        places: for each of them, the places of its parameters in the vector.
+    places: for each data set, the places of its parameters in the vector.
     """
 
     parts: tuple[Model, ...]
     box: Box
     places: tuple[tuple[int, ...], ...] = eqx.field(static=True)
     varying: bool = eqx.field(static=True)
+    objective: Objective = eqx.field(static=True, default="likelihood")  # which weighs data sets by their noise
 
     residuals, cost_at, log_prior = Model.residuals, Model.cost_at, Model.log_prior
     log_likelihood, log_likelihood_per_datum = Model.log_likelihood, Model.log_likelihood_per_datum
     log_posterior_unconstrained = Model.log_posterior_unconstrained
-
-    @property
-    def objective(self) -> Objective:
-        """Data sets are weighed against each other by their noise."""
-        return "likelihood"
 
     @property
     def values(self) -> Array:
@@ -366,7 +362,7 @@ class JointModel(eqx.Module):
         """Each data set is differentiated by its own parameters alone."""
         steps: list[Step] = [None] * len(self.parts)
         if step is not None:
-            sigmas = [step[0]] * len(self.parts) if step[0].size == 1 else self._split(step[0])
+            sigmas = [step[0]] * len(self.parts) if step[0].size == 1 else self.split(step[0])
             steps = [(sigma, step[1]) for sigma in sigmas]
         each = self._with_vectors(vector)
         found = [part.linear_parts(own, step) for (part, own), step in zip(each, steps, strict=True)]
@@ -374,7 +370,7 @@ class JointModel(eqx.Module):
         return self._together(vector, [residuals for residuals, _ in found]), (predicted, jnp.concatenate(rows))
 
     def _together(self, vector: Array, each: Sequence[tuple[Array, ...]]) -> tuple[Array, ...]:
-        """Residuals of the data sets as those of all: data, prior, levels of noise."""
+        """Residuals of all: data, prior, levels of noise."""
         levels = [level.reshape(-1) for _, _, *levels in each for level in levels]
         data = jnp.concatenate([residuals[0].reshape(-1) for residuals in each])
         return (data, self.box.prior_residuals(vector), *([jnp.concatenate(levels)] if levels else []))
@@ -382,15 +378,14 @@ class JointModel(eqx.Module):
     def _with_vectors(self, vector: Array) -> list[tuple[Model, Array]]:
         return [(part, vector[np.array(places)]) for part, places in zip(self.parts, self.places, strict=True)]
 
-    def _split(self, column: Array) -> list[Array]:
+    def split(self, column: Any) -> list[Any]:
         """What of a column (N, 1) belongs to each data set, in the shape of its values."""
-        shapes = [part.values.shape for part in self.parts]
-        split = jnp.split(column[:, 0], np.cumsum([math.prod(shape) for shape in shapes])[:-1])
-        return [share.reshape(shape) for share, shape in zip(split, shapes, strict=True)]
+        ends = pairwise(np.cumsum([0, *(part.values.size for part in self.parts)]))
+        return [column[a:b].reshape(part.values.shape) for part, (a, b) in zip(self.parts, ends, strict=True)]
 
     def _each(self, function: Callable[[Model, Array, Array], Any], vector: Array, predicted: Array) -> list[Any]:
         """What a function says of each data set."""
-        each = zip(self._with_vectors(vector), self._split(predicted), strict=True)
+        each = zip(self._with_vectors(vector), self.split(predicted), strict=True)
         return [function(part, own, share) for (part, own), share in each]
 
 

@@ -23,7 +23,7 @@ from fits._files import require_switch
 from fits.data.geometry import Floats
 from fits.data.measurements import LARGEST, Measurements
 from fits.names import Objective
-from fits.problem.discrepancy import Discrepancy, Process, Projection, project, size, softness
+from fits.problem.discrepancy import Discrepancy, softness
 from fits.problem.parameters import Free, is_free, require_number_or_free
 from layerjax._checks import in_short, require_choice, require_number
 
@@ -71,9 +71,8 @@ class Noise:
         if self.discrepancy is True:
             object.__setattr__(self, "discrepancy", Discrepancy())
         if not (self.discrepancy in (False, None) or isinstance(self.discrepancy, Discrepancy)):
-            raise ValueError(
-                f"Noise.discrepancy is {in_short(self.discrepancy)}; it must be true, false or Discrepancy"
-            )
+            given = in_short(self.discrepancy)
+            raise ValueError(f"Noise.discrepancy is {given}; it must be true, false or Discrepancy")
         if self.discrepancy and self.tails != "gaussian":
             raise ValueError(f"Noise.tails is {self.tails!r}; with model discrepancy it must be gaussian")
 
@@ -107,13 +106,8 @@ def tail_residual(z: Array, tails: Tails, degrees_of_freedom: Array) -> Array:
     return z * jnp.sqrt((nu + 1) / nu * jnp.where(x > TINY, jnp.log1p(tame) / tame, 1.0))
 
 
-def sigma_residual(sigma: Array, lowest: Array) -> Array:
-    """Residual whose half square is log(sigma / lowest) + 1/2; at least 1, so that its slope is finite."""
-    return level_residual(jnp.log(jnp.maximum(sigma / lowest, 1.0)))
-
-
 def level_residual(level: Array) -> Array:
-    """Residual whose half square is a level + 1/2, which is at least 0."""
+    """Residual whose half square is a level of at least 0, + 1/2; at least 1, so that its slope is finite."""
     return jnp.sqrt(1.0 + 2.0 * level)
 
 
@@ -126,11 +120,8 @@ def information_weights(tails: Tails, degrees_of_freedom: Array) -> tuple[Array,
 
 
 def named_residual(objective: Objective, predicted: Array, values: Array, cosine: Array) -> Array:
-    """Residuals of the literature, model minus datum, that are no likelihood; `cosine` is |cos theta_i|, shape (N, 1).
-
-    cosine_l2: f cos (Ngan 2005); log1p_cos: log(1 + f cos) (Low 2012), with f cos above -1/2; cube_root: the cube root
-    of f cos (after Fores 2012), offset by 1e-6 so that it is smooth at 0.
-    """
+    """Model minus datum in measures of the literature: f cos (Ngan 2005), log(1 + f cos) with f cos above -1/2
+    (Low 2012), or the cube root of f cos + 1e-6 (after Fores 2012); `cosine` is |cos theta_i|, (N, 1)."""
     if objective == "cosine_l2":
         return (predicted - values) * cosine
     if objective == "log1p_cos":
@@ -166,13 +157,6 @@ class Levels(NamedTuple):
         floor = self.floor.start if isinstance(self.floor, Free) else self.floor
         return softness(values, np.sqrt(self.variance + np.square(floor)))
 
-    def projection(self, process: Process, values: Floats) -> Projection | None:
-        """That of measurements (N, C) on a process of the discrepancy; None where it depends on parameters."""
-        if self.fitted:
-            return None
-        sigma = total_sigma(values, *map(np.asarray, self))
-        return project(np.asarray(process.weights, float), size(values, self.softness(values)) / sigma)
-
 
 def is_assumed(noise: Noise, used: Measurements) -> bool:
     """Whether nothing is stated of the noise, neither by the data nor by `Noise`, so that `DEFAULT_RELATIVE` holds."""
@@ -196,7 +180,5 @@ def require_size(levels: Levels) -> None:
     precision, median = jnp.finfo(jnp.result_type(float)), cast(float, levels.floor) / DEFAULT_FLOOR
     least, most = max(LEVELS[0], math.sqrt(precision.tiny)) / DEFAULT_FLOOR, min(LARGEST, math.sqrt(precision.max))
     if levels.floor and not least <= median <= most:
-        raise ValueError(
-            f"values: the median of |value| is {median:.3g} 1/sr; for noise relative to them it must be in "
-            f"[{least:.2g}, {most:.2g}], or Noise.floor be given"
-        )
+        words = f"for noise relative to them it must be in [{least:.2g}, {most:.2g}], or Noise.floor be given"
+        raise ValueError(f"values: the median of |value| is {median:.3g} 1/sr; {words}")

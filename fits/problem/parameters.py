@@ -1,11 +1,8 @@
 """Free parameters: what is fitted, between which bounds, under which prior, and how a tree of them becomes a vector.
 
-Three spaces, all of dimension P:
-
-- *physical* `vector`: the numbers that the stack holds;
-- *unit* `s` in [0, 1]: the bounds map to 0 and 1, linearly, or in the logarithm for a prior that lives there;
-  optimisers work here and starts are spread evenly here;
-- *unconstrained* `u = log(s / (1 - s))`: samplers work here, with the log-determinant of the map.
+Three spaces, all of dimension P: the *physical* `vector`, the numbers that the stack holds; *unit* `s` in [0, 1], where
+optimisers work, between the bounds, linearly, or in the logarithm for a prior that lives there; and *unconstrained*
+`u = log(s / (1 - s))`, where samplers work, with the log-determinant of the map.
 """
 
 import math
@@ -123,11 +120,8 @@ def _log_normaliser(prior: Prior, low: float, high: float) -> float:
 
 
 def _random_walk_normaliser(prior: Prior, steps: Floats, normalisers: Floats) -> Floats:
-    """Of channels (C,), by the normaliser of each and the steps between them: of all together, in the first.
-
-    Flat priors count once, for the walk starts anywhere; Gaussian ones by their joint precision. Bounds cut off nothing
-    of the steps.
-    """
+    """Of channels (C,), by the normaliser of each and the steps between them: of all together, in the first. Flat
+    priors count once, for the walk starts anywhere; Gaussian ones by their joint precision."""
     channels = len(normalisers)
     inverse_sd = prior.gaussian()[1]
     if inverse_sd > 0.0:
@@ -154,9 +148,7 @@ class Free:
     `random_walk_sd` holds channels together: the standard deviation of the difference between neighbours (of the
     logarithms for `LogNormal` and `LogUniform`), one or one for each of the C - 1 steps, say in proportion to the root
     of the distance in wavelength. It is a Gaussian random walk beside the prior of each channel, not cut off at bounds.
-
-    `same_for_all_texels` says that all texels of a map have this number in common, see `fits.fit_map`; in a fit of one
-    material it says nothing.
+    `same_for_all_texels`: all texels of a map have this number in common, see `fits.fit_map`.
     """
 
     start: float | Sequence[float]
@@ -318,10 +310,8 @@ def require_in_range(material: Any) -> None:
 
 
 class Box(eqx.Module):
-    """Bounds and priors of P parameters as arrays of shape (P,), and the maps between the three spaces.
-
-    differences: (Q, P), differences between neighbouring channels in units of `Free.random_walk_sd`.
-    """
+    """Bounds and priors of P parameters as arrays of shape (P,), and the maps between the three spaces; differences
+    between neighbouring channels are (Q, P), in units of `Free.random_walk_sd`."""
 
     low: Array
     high: Array
@@ -335,10 +325,8 @@ class Box(eqx.Module):
     def of(cls, free: Iterable[Free]) -> "Box":
         """The box of these parameters, one after the other."""
         free = list(free)
-        bounds = [entry.arrays() for entry in free]
-        low = np.concatenate([np.ravel(b[1]) for b in bounds]) if bounds else np.zeros(0)
-        high = np.concatenate([np.ravel(b[2]) for b in bounds]) if bounds else np.zeros(0)
-        priors = [entry.prior for entry, b in zip(free, bounds, strict=True) for _ in range(b[0].size)]
+        low, high = (np.concatenate([np.zeros(0), *(np.ravel(entry.arrays()[k]) for entry in free)]) for k in (1, 2))
+        priors = [entry.prior for entry in free for _ in range(math.prod(entry.shape))]
         gaussians = np.array([prior.gaussian() for prior in priors]).reshape(-1, 2)
         logs = np.array([_log_normaliser(prior, a, b) for prior, a, b in zip(priors, low, high, strict=True)])
         differences = [np.zeros((0, len(low)))]
@@ -388,11 +376,8 @@ class Box(eqx.Module):
         return jnp.where(inside, density, -jnp.inf)
 
     def prior_residuals(self, vector: Array) -> Array:
-        """Standardised distance from the prior's centre, (P,), 0 for flat priors; and between neighbours, (Q,).
-
-        Their squares are the prior's part in the fit, whose optimum is therefore the mode in the coordinate where the
-        prior is Gaussian or flat: the logarithm for `LogNormal` and `LogUniform`.
-        """
+        """Standardised distance from the prior's centre, (P,), 0 for flat priors; and between neighbours, (Q,). The
+        optimum of a fit is the mode in the coordinate where the prior is Gaussian or flat."""
         natural = self._natural(vector)
         own = (natural - self.centre) * self.inverse_sd
         return own if not self.differences.shape[0] else jnp.concatenate([own, self.differences @ natural])
@@ -435,8 +420,7 @@ class Template(eqx.Module):
 
 
 def split(tree: Any, rename: Any = lambda name: name) -> tuple[Template, dict[str, Free]]:
-    """Take the free parameters out of a tree: the template, and the parameters by paths such as
-    ``layers[0].thickness``, in the order of the vector."""
+    """The template of a tree, and its free parameters by paths (``layers[0].thickness``), as the vector has them."""
     paths, structure = jax.tree.flatten_with_path(tree, is_leaf=is_free)
     slots, free, offset = [], {}, 0
     for index, (path, leaf) in enumerate(paths):

@@ -1,11 +1,10 @@
 """A fitting problem: stacks, data sets, noise model, instrument; one measurement, or several with parameters in common.
 
-`Problem` and `Joint` are what users and results hold; their `model` holds the same as arrays, for compiled programs.
+`Problem` and `Joint` are what users hold; their `model` holds the same as arrays, for compiled programs.
 """
 
 import abc
 import copy
-import math
 import re
 import warnings
 from collections.abc import Callable, Mapping, Sequence
@@ -41,6 +40,7 @@ from layerjax.mixture import require_material
 from layerjax.stack import with_known
 from layerjax.transport.known_directions import known_directions
 
+# of parameters by how their names end; all others are plain ratios
 UNITS = {
     "noise.floor": "1/sr",
     "instrument.tilt": "deg",
@@ -51,10 +51,8 @@ UNITS = {
     "mu_s": "1/mm",
     "mu_a": "1/mm",
 }
-"""Units of parameters by how their names end; all others are plain ratios."""
-
+# how names begin of what stands in each place of `Parts`
 PLACES = ("", "scale", "instrument", "noise.relative", "noise.floor", "noise.discrepancy")
-"""How names begin of what stands in each place of `Parts`."""
 
 
 class Assembled(NamedTuple):
@@ -65,11 +63,7 @@ class Assembled(NamedTuple):
 
 
 class FittingProblem(abc.ABC):
-    """One data set or several: parameters in a box, and what the data say of them, as functions of the vector (P,).
-
-    Attributes:
-        problems: a `Problem` for each data set, by its name; one measurement by itself has none: "".
-    """
+    """One data set or several: parameters in a box, and what the data say of them, as functions of the vector (P,)."""
 
     objective: Objective
 
@@ -81,7 +75,7 @@ class FittingProblem(abc.ABC):
     @property
     @abc.abstractmethod
     def problems(self) -> "Mapping[str, Problem]":
-        """A `Problem` for each data set, by its name."""
+        """A `Problem` for each data set, by its name; one measurement by itself has none: ""."""
 
     @abc.abstractmethod
     def with_problems(self, changed: "Mapping[str, Problem]") -> "FittingProblem":
@@ -135,9 +129,8 @@ class FittingProblem(abc.ABC):
 
     def shares(self, predicted: Floats) -> dict[str, Floats]:
         """What `predict` gives of each data set, in the shape of its data."""
-        shapes = [problem.model.values.shape for problem in self.problems.values()]
-        split = np.split(predicted.ravel(), np.cumsum([math.prod(shape) for shape in shapes])[:-1])
-        return {name: part.reshape(shape) for name, part, shape in zip(self.problems, split, shapes, strict=True)}
+        split = self.model.split(predicted) if len(self.problems) > 1 else [predicted]
+        return dict(zip(self.problems, split, strict=True))
 
     def build(self, vector: ArrayLike) -> Any:
         """Stack, scale and noise levels with the physical vector (P,)."""
@@ -168,8 +161,8 @@ class FittingProblem(abc.ABC):
         return self.call(Model.log_posterior_unconstrained, u)
 
     def call(self, function: Callable[..., Any], *arguments: Any) -> Any:
-        """`function(model, *arguments)`, compiled once for all of this structure; of a method of `Model` the model's
-        own of that name."""
+        """`function(model, *arguments)`, compiled once for all of this structure; of a `JointModel` its own method of
+        the name of one of `Model`."""
         if function in vars(Model).values():
             function = getattr(type(self.model), function.__name__)
 
@@ -239,7 +232,7 @@ class Problem(FittingProblem):
 
     @property
     def problems(self) -> "dict[str, Problem]":
-        """The one measurement, which has no name."""
+        """The one measurement."""
         return {"": self}
 
     def with_problems(self, changed: "Mapping[str, Problem]") -> "Problem":
@@ -265,7 +258,7 @@ class Problem(FittingProblem):
 
 
 class JointParts(NamedTuple):
-    """What a vector makes of each data set, by its name: stacks, and calibration factors."""
+    """Stacks and calibration factors of data sets, by their names."""
 
     stack: dict[str, Any]
     scale: dict[str, Any]
@@ -329,12 +322,10 @@ class Joint(FittingProblem):
                     raise ValueError(f"Joint.shared: {words} is not free in {part!r}; it must be in every problem")
         common = {name: one for name, one in common.items() if any(_begins(given, name) for given in self.shared)}
         for (name, one), (part, free) in product(common.items(), others):
-            other = free[name]
-            same = one.shape == other.shape and (one.low, one.high, one.prior) == (other.low, other.high, other.prior)
-            if not (same and one.random_walk_sd == other.random_walk_sd):
-                raise ValueError(
-                    f"Joint.shared: {name} has other bounds or another prior in {part!r} than in {first!r}"
-                )
+            own, other = ((of.shape, of.low, of.high, of.prior, of.random_walk_sd) for of in (one, free[name]))
+            if own != other:
+                words = f"{name} has other bounds or another prior in {part!r} than in {first!r}"
+                raise ValueError(f"Joint.shared: {words}")
         return common
 
     def build(self, vector: ArrayLike) -> JointParts:
@@ -373,8 +364,6 @@ def _assemble(problem: Problem) -> Assembled:
     process = correlation = setting = None
     if isinstance(noise.discrepancy, Discrepancy):
         process = make_process(used.wi, used.wo, used.values.shape[1])
-        projection = levels.projection(process, used.values)
-        process = replace(process, projection=jax.tree.map(jnp.asarray, projection))
         correlation = numbers_of(noise.discrepancy, np.asarray(process.shortest), used.values.shape[1])
     if problem.instrument is not None:
         setting = setting_of(problem.instrument, polar_angles(problem.data))
@@ -403,7 +392,7 @@ def _assemble(problem: Problem) -> Assembled:
         varying=levels.varying if process is None else levels.fitted,
         moving=sum(not name.startswith("noise.") for name in names),
         **_directions(problem, used.wi, used.wo),
-    )
+    ).with_projection()
     start = jnp.asarray(np.concatenate([entry.arrays()[0].ravel() for entry in free.values()]))
     material = model.build(start).stack
     if isinstance(material, lj.Stack | lj.Mixture):
@@ -496,8 +485,7 @@ def with_floor(noise: Noise, instrument: Instrument | None) -> Noise:
 
 
 def polar_angles(data: Measurements) -> Floats:
-    """Polar angles of the light, (K,), of the used samples, in degrees; within `SAME_ANGLE` they are one, at all
-    azimuths."""
+    """Polar angles of the light, (K,), of the used samples, in degrees; within `SAME_ANGLE` they are one."""
     theta = data.used().theta_i
     return np.round([np.mean(theta[rows]) for rows in groups(theta)], 2)
 

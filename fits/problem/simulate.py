@@ -29,8 +29,7 @@ def simulate(
     Args:
         stack: holds numbers, nothing `Free`.
         geometry: N pairs of directions, from `slices` say.
-        transport: as in `Problem`: a layerjax transport that is not random, "auto", or any callable
-            (stack, wi, wo) -> values.
+        transport: as in `Problem`.
         noise: relative, in [0, 1] (0.05 is 5 %).
         floor: in 1/sr, >= 0.
         seed: of the noise.
@@ -53,17 +52,10 @@ def simulate(
     sigma = np.hypot(noise * exact, floor)
     noisy = exact + sigma * np.random.default_rng(seed).standard_normal(exact.shape)
     notes = (f"noise: relative {noise:g}, floor {floor:g} 1/sr, seed {seed}",)
-    noiseless = np.any(sigma < SMALLEST_SIGMA, axis=1)
     known = noise > 0 or floor > 0
-    return Measurements(
-        geometry.wi,
-        geometry.wo,
-        noisy,
-        sigma if known else None,
-        ~noiseless if known else np.ones_like(noiseless),
-        channel_names(exact.shape[1]),
-        Source("", "simulated", "brdf", notes),
-    )
+    mask = ~(known & np.any(sigma < SMALLEST_SIGMA, axis=1))
+    source, channels = Source("", "simulated", "brdf", notes), channel_names(exact.shape[1])
+    return Measurements(geometry.wi, geometry.wo, noisy, sigma if known else None, mask, channels, source)
 
 
 def require_visible(subject: str, material: object, **directions: Floats) -> None:
@@ -73,7 +65,5 @@ def require_visible(subject: str, material: object, **directions: Floats) -> Non
     for name, w in directions.items():
         lowest = float(polar(w).max(initial=0.0))
         if lowest >= 90.0:
-            raise ValueError(
-                f"{subject}: a {name} at {lowest:g} degrees sees nothing of an opaque stack; "
-                "its polar angle must be in [0, 90) degrees"
-            )
+            words = "sees nothing of an opaque stack; its polar angle must be in [0, 90) degrees"
+            raise ValueError(f"{subject}: a {name} at {lowest:g} degrees {words}")

@@ -1,33 +1,19 @@
 """Stacks and fitting problems as TOML: a table for each layer and the base, and a table where a number is free.
 
-    transport = "SingleScattering"             # optional, "auto" by default; { kind = "AddingDoubling", nodes = 16 }
-    objective = "likelihood"                   # optional
-    about = { source = "..." }                 # optional: a table of texts that are kept and not looked at
-    gallery = "fabric"                         # optional: a material by name, in place of layers and base
+    transport = { kind = "AddingDoubling", nodes = 16 }
 
     [[layers]]                                 # from top to bottom
     kind = "Medium"
     thickness = { start = 0.5, low = 0.0, high = 5.0, prior = { kind = "Normal", mean = 0.5, sd = 0.2 } }
     phase = { kind = "SGGX", shape = "surface", alpha = 0.3 }
-    f0 = { start = 0.04, low = 0.0, high = 0.2, same_for_all_texels = true }   # see `Free`
 
     [base]
     kind = "Lambertian"
     albedo = [0.1, 0.2, 0.3]                   # one number, or one a channel
 
-    [mixture.bare]                             # in place of layers and base: parts, each with layers and a base, a name
-    weight = 0.3                               # of the gallery, or a mixture; omitted in one, which covers the rest
-
-    [noise]                                    # optional: relative, floor, use_sigma, tails, degrees_of_freedom,
-                                               # discrepancy: true, or a table of its amplitude and lengths
-    [scale]                                    # optional common calibration factor: start, low, high, prior
-
-    [instrument]                               # optional: apertures, tilt, gain_sd, floor, rings: see `Instrument`
-
-    [options]                                  # optional: thresholds of the fit, see `fits.FitOptions`
-
-Keys are the parameters of the classes of the same name, which say what may stand there; the `kind` of an SGGX is called
-`shape` here. Bad input is a ValueError on one line that names the place (``layers[0]``) and the parameter.
+``docs/guides/own_data.md`` says what else may stand there. Keys are the parameters of the classes of the same name; the
+`kind` of an SGGX is called `shape` here. Bad input is a ValueError on one line that names the place (``layers[0]``) and
+the parameter.
 """
 
 import difflib
@@ -57,8 +43,7 @@ from layerjax.mixture import require_material
 ANY = (-math.inf, math.inf)
 _LONGEST = 60  # letters of a key that an error suggests others for
 
-MATERIAL = ("gallery", "layers", "base", "mixture")
-"""Keys of a material: of a stack, or what stands in its place."""
+MATERIAL = ("gallery", "layers", "base", "mixture")  # keys of a stack, or of what stands in its place
 
 _Kinds = Mapping[str, type]
 _LAYERS: _Kinds = {kind.__name__: kind for kind in (lj.Interface, lj.Medium, lj.TurbidMedium)}
@@ -118,11 +103,7 @@ def read_problem(path: str | Path) -> ProblemFile:
 
 
 def read_instrument(path: str | Path) -> Instrument:
-    """The ``[instrument]`` of a TOML file, whatever else it holds.
-
-    Raises:
-        ValueError: as `read_problem`, or there is none.
-    """
+    """The ``[instrument]`` of a TOML file, whatever else it holds. ValueError as of `read_problem`, or without one."""
     _, tables = read_tables(Path(path))
     try:
         if "instrument" not in tables:
@@ -165,7 +146,7 @@ def write_problem(
     material_from_dict(material_to_dict(stack))  # refuses what could not be read again
     transport_from_dict(transport_to_dict(transport))
     given = {"noise": noise, "instrument": instrument, "scale": scale}
-    tables |= to_plain({name: value for name, value in given.items() if value is not None})
+    tables |= {name: _to_plain(value) for name, value in given.items() if value is not None}
     write_text(path, tomli_w.dumps(tables), force)
 
 
@@ -187,18 +168,14 @@ def read_tables(path: Path) -> tuple[str, dict[str, Any]]:
 
 
 def stack_from_dict(tables: Mapping[str, Any], where: str = "") -> lj.Stack:
-    """A stack, with `Free` parameters where a number is given as a table, from the `layers` and `base` of a file.
-
-    where: of the file they stand, such as ``mixture.bare.``.
-    """
-    check_keys(f"{where.rstrip('.') or 'the stack'}", tables, ("layers", "base"))
+    """The stack that `layers` and `base` of a file say, at a place (``mixture.bare.``) or at its top."""
+    check_keys(where.rstrip(".") or "the stack", tables, ("layers", "base"))
     layers = tables.get("layers", [])
     if not isinstance(layers, list):
         raise ValueError(f"{where}layers is not a list of tables, must be written as [[{where}layers]]")
     if not layers and "base" not in tables:
-        raise ValueError(
-            f"there is neither a layer nor a base, must be at least one: [[{where}layers]] or [{where}base]"
-        )
+        words = f"must be at least one: [[{where}layers]] or [{where}base]"
+        raise ValueError(f"there is neither a layer nor a base, {words}")
     stack = lj.Stack(
         [_build(f"{where}layers[{index}]", layer, _LAYERS) for index, layer in enumerate(layers)],
         base=_build(f"{where}base", tables["base"], _BASES) if "base" in tables else None,
@@ -208,7 +185,7 @@ def stack_from_dict(tables: Mapping[str, Any], where: str = "") -> lj.Stack:
 
 
 def material_from_dict(tables: Mapping[str, Any], where: str = "") -> lj.Stack | lj.Mixture:
-    """A material of the gallery by its name, a mixture, or what `layers` and `base` say; where: see above."""
+    """A material of the gallery by its name, a mixture, or what `layers` and `base` say."""
     for whole in ("gallery", "mixture"):
         if whole in tables and len(tables) > 1:
             others = " and ".join(key for key in MATERIAL if key != whole and key in tables)
@@ -300,9 +277,8 @@ def choice(where: str, value: Any, allowed: Iterable[str]) -> str:
     """The value itself, if it is one of the allowed words; ValueError, with a likely one, for anything else."""
     allowed = tuple(allowed)
     if not (isinstance(value, str) and value in allowed):
-        raise ValueError(
-            f"{where} is {in_short(value)}{_suggestion(value, allowed)}, must be one of {', '.join(allowed)}"
-        )
+        given = f"{in_short(value)}{_suggestion(value, allowed)}"
+        raise ValueError(f"{where} is {given}, must be one of {', '.join(allowed)}")
     return value
 
 
@@ -310,9 +286,8 @@ def check_keys(where: str, table: Mapping[str, Any], allowed: tuple[str, ...]) -
     """Raise a ValueError for a key of the table that is not among the allowed ones."""
     for key in table:
         if key not in allowed:
-            raise ValueError(
-                f"{where} has an unknown key {in_short(key)}{_suggestion(key, allowed)}; allowed: {', '.join(allowed)}"
-            )
+            given = f"{in_short(key)}{_suggestion(key, allowed)}"
+            raise ValueError(f"{where} has an unknown key {given}; allowed: {', '.join(allowed)}")
 
 
 def require_table(where: str, table: Any) -> dict[str, Any]:
@@ -333,19 +308,17 @@ def _suggestion(value: Any, allowed: Iterable[str]) -> str:
 def material_to_dict(material: lj.Stack | lj.Mixture) -> dict[str, Any]:
     """The inverse of `material_from_dict`, of plain numbers, strings, lists and dictionaries."""
     if isinstance(material, lj.Mixture):
-        given = {name: {} if value is None else {"weight": value} for name, value in material.weights.items()}
+        weights = {name: {"weight": _to_plain(one)} for name, one in material.weights.items() if one is not None}
         parts = {name: material_to_dict(part) for name, part in material.parts.items()}
-        return {"mixture": {name: to_plain(given[name]) | part for name, part in parts.items()}}
-    tables: dict[str, Any] = (
-        {"layers": [_module_to_dict(layer) for layer in material.layers]} if material.layers else {}
-    )
+        return {"mixture": {name: weights.get(name, {}) | part for name, part in parts.items()}}
+    tables: dict[str, Any] = {"layers": list(map(_module_to_dict, material.layers))} if material.layers else {}
     return tables if material.base is None else tables | {"base": _module_to_dict(material.base)}
 
 
-def changed_to_dict(thing: Noise | Instrument | Discrepancy | Free) -> dict[str, Any]:
-    """What is not as it is by default, of plain numbers, strings, lists and dictionaries."""
+def _changed_to_dict(thing: Noise | Instrument | Discrepancy | Free) -> dict[str, Any]:
+    """What is not as it is by default."""
     every = {entry.name: (getattr(thing, entry.name), entry.default) for entry in fields(thing)}
-    return {name: to_plain(value) for name, (value, default) in every.items() if value != default}
+    return {name: _to_plain(value) for name, (value, default) in every.items() if value != default}
 
 
 def transport_to_dict(transport: lj.Transport | Literal["auto"]) -> str | dict[str, Any]:
@@ -359,21 +332,19 @@ def transport_to_dict(transport: lj.Transport | Literal["auto"]) -> str | dict[s
 def _module_to_dict(module: Any) -> dict[str, Any]:
     """The table of a layer, base, phase function, transport or prior; what is None is omitted."""
     names = inspect.signature(type(module)).parameters
-    entries = {_key(name): to_plain(getattr(module, name)) for name in names if getattr(module, name) is not None}
+    entries = {_key(name): _to_plain(getattr(module, name)) for name in names if getattr(module, name) is not None}
     return {"kind": type(module).__name__, **entries}
 
 
-def to_plain(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {name: to_plain(one) for name, one in value.items()}
-    if isinstance(value, Free | Noise | Instrument):
-        return changed_to_dict(value)
+def _to_plain(value: Any) -> Any:
     if isinstance(value, str | bool | int):
         return value
+    if isinstance(value, Free | Noise | Instrument):
+        return _changed_to_dict(value)
+    if isinstance(value, Discrepancy):
+        return _changed_to_dict(value) or True
     if isinstance(value, lj.PhaseFunction | Prior | PowerLaw):
         return _module_to_dict(value)
-    if isinstance(value, Discrepancy):
-        return changed_to_dict(value) or True
     array = np.asarray(value)
     if array.dtype.kind == "i":
         return array.tolist()

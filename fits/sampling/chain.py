@@ -1,8 +1,8 @@
 """A chain in memory that also survives being killed: emcee's backend, whose steps go to a store block by block.
 
-A block is written every second and at every check, with the state of the random generator, so that a chain which is
-gone on with is the one that it would have been. What a kill costs is at most the second of steps that was in hand. How
-the chain is moved is decided before its first step and kept with it.
+A block is written every second and at every check, with the state of the random generator, so that a resumed chain is
+the one that it would have been; a kill costs at most a second of steps. How the chain is moved is decided before its
+first step and kept with it.
 """
 
 import time
@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 
 from fits.store import Store
 
-SECONDS = 1.0
-"""Between two blocks."""
+SECONDS = 1.0  # between two blocks
 
 
 class Chain(Backend):
@@ -34,13 +33,12 @@ class Chain(Backend):
         self.moves: dict[str, Any] = {}
         self.options: dict[str, Any] = {}
         self._store, self._stored, self._written = store, 0, time.monotonic()
-        blocks = [] if store is None else store.all("steps")
-        if store is not None:
-            self.moves, self.options = store.get("moves") or {}, store.get("options") or {}
-        if blocks:
-            self.chain, self.log_prob = (
-                np.concatenate([block[name] for block in blocks]) for name in ("coords", "log_prob")
-            )
+        if store is None:
+            return
+        self.moves, self.options = store.get("moves") or {}, store.get("options") or {}
+        if blocks := store.all("steps"):
+            self.chain = np.concatenate([block["coords"] for block in blocks])
+            self.log_prob = np.concatenate([block["log_prob"] for block in blocks])
             self.accepted, self.random_state = blocks[-1]["accepted"], tuple(blocks[-1]["random_state"])
             self.iteration = self._stored = len(self.chain)
 

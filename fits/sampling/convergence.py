@@ -17,10 +17,8 @@ from fits.sampling.options import FIRST_CHECK, SamplerOptions
 
 GROUPS = 4
 FEWEST_DRAWS = 8
-
-
+# steps after which a chain is looked at, however often a run resumes: 100, 200, ... 1000, then a tenth farther
 CHECKS = FIRST_CHECK * np.unique(np.ceil(1.1 ** np.arange(100.0)).astype(int))
-"""Steps after which a chain is looked at, however often a run resumes: 100, 200, ... 1000, then a tenth farther."""
 
 
 def next_check(step: int) -> int:
@@ -30,11 +28,8 @@ def next_check(step: int) -> int:
 
 @dataclass(frozen=True, eq=False)
 class Convergence:
-    """How far a chain of P parameters has come, by its draws after the burn-in.
-
-    draws: steps after the burn-in. autocorrelation_time: (P,), in steps. ess: (P,), the smaller of bulk and tail.
-    r_hat: (P,).
-    """
+    """How far a chain of P parameters has come, by its `draws`, steps after the burn-in; autocorrelation time in steps,
+    ESS, the smaller of bulk and tail, and R-hat, (P,) each."""
 
     draws: int
     autocorrelation_time: Floats

@@ -19,12 +19,10 @@ from fits.sampling.mixture import Mixture
 from fits.sampling.options import SamplerOptions
 from fits.sampling.proposals import Density, FittedProposal, propose
 
+# steps after which proposals are fitted again: often while the chain is short, seldom once it is long
 FITS = (25 * 1.5 ** np.arange(40.0)).astype(int)
-"""Steps after which proposals are fitted again: often while the chain is short, seldom once it is long."""
-
+# length of differential evolution; 2.38 is best for a normal posterior, but curved ones are narrower than they are long
 DIFFERENCE = 1.2
-"""Length of differential evolution, where 2.38 is best for a normal posterior: curved ones are narrower than they are
-long."""
 
 
 class Ensemble:
@@ -62,20 +60,14 @@ class Ensemble:
 
     def _first_state(self) -> emcee.State:
         generator = np.random.RandomState(self.seed)
-        positions = first_positions(
-            Mixture(**self.chain.moves["initial"]), self.log_posteriors, self.chain.shape[0], generator
-        )
+        initial = Mixture(**self.chain.moves["initial"])
+        positions = first_positions(initial, self.log_posteriors, self.chain.shape[0], generator)
         return emcee.State(positions, random_state=generator.get_state())  # else emcee copies numpy's global state
 
 
 def proposals_of(chain: Chain, fewest: int = 1) -> Density:
-    """What proposals are drawn from until the next fit: fitted to the second half of the chain up to the last one.
-
-    fewest: draws that they are fitted to, at least.
-
-    As fits grow apart, so the adaptation fades; and a chain that is gone on with is the same, for it depends on whole
-    fits only.
-    """
+    """What proposals are drawn from until the next fit: fitted to the second half of the chain up to the last one, of
+    so many draws at least. As fits grow apart, adaptation fades; a chain that resumes depends on whole fits only."""
     initial, last = Mixture(**chain.moves["initial"]), FITS[chain.iteration >= FITS].max(initial=0)
     if (last - last // 2) * chain.shape[0] < fewest:
         return initial

@@ -17,7 +17,7 @@ from scipy.special import logit, logsumexp
 
 from fits.data.geometry import Floats
 from fits.optimise.multi_start import least_squares_descent, unit_of
-from fits.optimise.result import Fit, Minimum
+from fits.optimise.result import Fit
 from fits.optimise.uncertainty import local_information, uncertainty
 from fits.problem.compilation import cores, in_shares
 from fits.problem.model import Model
@@ -39,19 +39,17 @@ LOWEST_MINIMUM = 8.0  # in the log-posterior, below the best: what lies lower ho
 def initial_mixture(
     fit: Fit, share: int, smallest_mode: float = SamplerOptions.smallest_mode, *, along_ridges: bool = True
 ) -> Mixture:
-    """About those minima of a fit that hold a share of its posterior, in whose modes its components are.
+    """About those minima of a fit that hold a share of its posterior, each a mode; share: see `log_posteriors`.
 
-    share: see `log_posteriors`.
     along_ridges: which takes some hundred Jacobians where a direction is unidentified.
     """
     problem = fit.problem
     found = [_about(problem, fit.vector, np.isin(problem.names, fit.at_bound), share, along_ridges)]
-    for minimum in other_minima(fit):
-        end = least_squares_descent(problem, unit_of(problem, vector_of(fit, minimum)), fresh=False)
+    for vector in other_minima(fit):
+        end = least_squares_descent(problem, unit_of(problem, vector), fresh=False)
         position = logit(np.clip(unit_of(problem, end.vector), INSIDE, 1.0 - INSIDE))[None]
-        if end.cost >= fit.cost + LOWEST_MINIMUM or any(
-            np.min(one.squared_distance(position)) < APART**2 for one in found
-        ):
+        near = any(np.min(one.squared_distance(position)) < APART**2 for one in found)
+        if near or end.cost >= fit.cost + LOWEST_MINIMUM:
             continue
         at_bound = uncertainty(problem, end.vector, end.cost).at_bound
         found.append(_about(problem, end.vector, at_bound, share, along_ridges))
@@ -75,9 +73,8 @@ def _about(problem: Problem, vector: Floats, at_bound: NDArray[np.bool_], share:
     information = np.concatenate([found.rows, found.bounds], axis=1)
     # no closer to a bound than half a deviation, that of the others given: there is no slope in log-odds next to it
     within = np.minimum(0.5 / np.maximum(np.linalg.norm(information, axis=1), 0.5 / WIDEST_IN_BOX), 0.5)
-    points = np.where(
-        at_bound, np.clip(found.points, INSIDE, 1.0 - INSIDE), np.clip(found.points, within, 1.0 - within)
-    )
+    within = np.where(at_bound, INSIDE, within)
+    points = np.clip(found.points, within, 1.0 - within)
     free, count = np.flatnonzero(~at_bound), len(points)
     in_log_odds = (information * (points * (1.0 - points))[:, None])[..., free]
     widest = np.tile(np.eye(len(free)) / WIDEST, (count, 1, 1))
@@ -99,10 +96,7 @@ def _about(problem: Problem, vector: Floats, at_bound: NDArray[np.bool_], share:
 
 
 def normal_draws(fit: Fit, count: int, generator: np.random.RandomState) -> Floats:
-    """Draws (count, P) by the covariance of a fit, without a look at its posterior.
-
-    Parameters at a bound lie at an exponentially distributed distance from it.
-    """
+    """Draws (count, P) by the covariance of a fit, without a look at its posterior."""
     unit = np.clip(unit_of(fit.problem, fit.vector), INSIDE, 1.0 - INSIDE)
     at_bound = np.isin(fit.problem.names, fit.at_bound)
     free = np.flatnonzero(~at_bound)
@@ -119,16 +113,10 @@ def normal_draws(fit: Fit, count: int, generator: np.random.RandomState) -> Floa
     return drawn
 
 
-def other_minima(fit: Fit) -> list[Minimum]:
-    """Minima of a likelihood's fit, beside the best, that its posterior may have a mode at."""
-    if not fit.is_posterior:
-        return []
-    return [one for one in fit.minima[1:] if one.cost < fit.cost + LOWEST_MINIMUM][: MOST_MODES - 1]
-
-
-def vector_of(fit: Fit, minimum: Minimum) -> Floats:
-    """The values of a minimum of a fit, (P,)."""
-    return np.array([minimum.values[name] for name in fit.problem.names])
+def other_minima(fit: Fit) -> list[Floats]:
+    """The minima of a fit, (P,) each, beside the best, that its posterior may have a mode at."""
+    close = [one for one in fit.minima[1:] if one.cost < fit.cost + LOWEST_MINIMUM]
+    return [np.array([one.values[name] for name in fit.problem.names]) for one in close[: MOST_MODES - 1]]
 
 
 def log_posteriors(problem: FittingProblem, positions: Floats, share: int, compiled: bool = False) -> Floats:
@@ -150,14 +138,9 @@ def _log_posteriors(model: Model, positions: Array) -> Array:
 def first_positions(
     mixture: Mixture, log_posterior: Callable[[Floats], Floats], walkers: int, generator: np.random.RandomState
 ) -> Floats:
-    """Draws (walkers, P), all of finite posterior; closer to the centres if that is needed.
-
-    Raises ValueError if even a narrow cloud holds points of posterior zero.
-    """
+    """Draws (walkers, P), all of finite posterior; closer to the centres if that is needed, else ValueError."""
     for shrink in 0.5 ** np.arange(12):
         positions = mixture.draw(generator, walkers, float(shrink))
         if np.all(np.isfinite(log_posterior(positions))):
             return positions
-    raise ValueError(
-        "sampling: points next to the optimum have posterior zero; the model gives values that are not finite"
-    )
+    raise ValueError("sampling: the posterior next to the optimum is zero; the model gives values that are not finite")

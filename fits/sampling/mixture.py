@@ -25,11 +25,9 @@ NARROWEST, INSIDE = 1e-9, 1e-9  # in log-odds; of the box
 class Mixture:
     """A density over the unconstrained vectors of a problem with P parameters: M multivariate Student-t densities.
 
-    A parameter at a bound follows none of them: its distance from the bound is exponentially distributed.
-
-    centre: (M, P). root: (M, P, P), whose product with its transpose is the scale matrix, 0 for parameters at a
-    bound. at_bound: (M, P) bool. distance: (M, P), mean distance from the bound in boxes. log_weight: (M,). mode: (M,),
-    which mode of the posterior a component belongs to; 0 is that of the best minimum.
+    centre: (M, P). root: (M, P, P), of the scale matrix. at_bound: (M, P) bool: such a parameter follows none of them,
+    its distance from the bound is exponentially distributed. distance: (M, P), the mean of that in boxes. log_weight:
+    (M,). mode: (M,), which mode of the posterior a component belongs to; 0 is that of the best minimum.
     """
 
     centre: Floats
@@ -48,21 +46,14 @@ class Mixture:
     @classmethod
     def of_modes(cls, parts: Sequence["Mixture"]) -> "Mixture":
         """Mixtures about the modes of a posterior, by the masses that they have as weights."""
+        joined = cls(*(np.concatenate([vars(part)[name] for part in parts]) for name in cls.__dataclass_fields__))
         mode = np.repeat(np.arange(len(parts)), [len(part.centre) for part in parts])
-        joined = cls.joined(parts)
         return replace(joined, mode=mode, log_weight=joined.log_weight - logsumexp(joined.log_weight))
 
     @classmethod
-    def joined(cls, parts: Sequence["Mixture"]) -> "Mixture":
-        """All components of several mixtures."""
-        return cls(**{name: np.concatenate([vars(part)[name] for part in parts]) for name in cls.__dataclass_fields__})
-
-    @classmethod
     def fitted(cls, positions: Floats, generator: np.random.RandomState) -> "Mixture":
-        """Fitted to samples (count, P), two at least, by expectation and maximisation.
-
-        Each component counts as a few samples of its own, so that it keeps its full rank.
-        """
+        """Fitted to samples (count, P), two at least, by expectation and maximisation; each component counts as a few
+        samples of its own, so that it keeps its full rank."""
         samples = positions[generator.permutation(len(positions))[:MOST_SAMPLES]]  # of all walkers
         dimension = samples.shape[1]
         values, directions = np.linalg.eigh(np.atleast_2d(np.cov(samples.T)))
@@ -91,7 +82,7 @@ class Mixture:
 
     @property
     def mode_count(self) -> int:
-        """How many modes the posterior has, as far as the fit knows."""
+        """How many modes the fit knows of."""
         return int(self.mode.max()) + 1
 
     def mode_of(self, positions: Floats) -> NDArray[np.int64]:

@@ -2,8 +2,7 @@
 
 Each begins with a draw of Laplace's approximation, whose covariance is the first metric, and finds its own metric and
 step size by blackjax's window adaptation. A step is a trajectory after a jump to a draw of the fitted mixture, which is
-taken by the rule of Metropolis and Hastings: trajectories alone never find the way to another mode. blackjax is an
-extra, and imported on first use.
+taken by the rule of Metropolis and Hastings: trajectories alone never find another mode. blackjax is an extra.
 """
 
 from collections.abc import Callable
@@ -43,23 +42,21 @@ def require_blackjax() -> None:
 class Nuts:
     """Moves the chains about the optimum of a fit. A step depends on the seed, its number, and where the chains are."""
 
-    def __init__(self, fit: Fit, chain: Chain, seed: int, options: SamplerOptions, progress: Progress | None):
+    def __init__(self, fit: Fit, chain: Chain, seed: int, options: SamplerOptions, progress: Progress):
         self.problem, self.chain, self.seed = fit.problem, chain, seed
         self._compiled: set[Callable[..., Any]] = set()
         if not chain.moves:
             self._warm_up(initial_mixture(fit, share_of(chain.shape[0]), options.smallest_mode), options, progress)
 
-    def _warm_up(self, initial: Mixture, options: SamplerOptions, progress: Progress | None) -> None:
+    def _warm_up(self, initial: Mixture, options: SamplerOptions, progress: Progress) -> None:
         """Before the first step, and for all: where each chain begins, its metric, and the length of its steps."""
         generator = np.random.RandomState(self.seed)
         metric = np.atleast_2d(np.cov(initial.best.draw(generator, DRAWS).T))
         positions = first_positions(initial, self._log_posteriors, self.chain.shape[0], generator)
-        if progress is not None:
-            progress("warm-up", 0, None, f"{options.warm_up} steps of each of {len(positions)} chains")
+        progress("warm-up", 0, None, f"{options.warm_up} steps of each of {len(positions)} chains")
         adapt = _adaptation(options.warm_up, options.target_acceptance)
         positions, step_sizes, metrics = self._on_all_cores(adapt, positions, metric=metric)
-        if progress is not None:
-            progress("warm-up", options.warm_up, options.warm_up)
+        progress("warm-up", options.warm_up, options.warm_up)
         moves = {"initial": initial.record(), "positions": positions, "step_sizes": step_sizes, "metrics": metrics}
         self.chain.decide(moves)
 
@@ -78,9 +75,8 @@ class Nuts:
             positions, log_posterior, divergent = self._on_all_cores(
                 _step, positions, number=chain.iteration + 1, step_sizes=moves["step_sizes"], metrics=moves["metrics"]
             )
-            chain.save_step(
-                emcee.State(positions, log_prob=log_posterior, random_state=generator.get_state()), ~divergent
-            )
+            state = emcee.State(positions, log_prob=log_posterior, random_state=generator.get_state())
+            chain.save_step(state, ~divergent)
             show()
 
     def _on_all_cores(self, function: Callable[..., Any], positions: Floats, **settings: Any) -> list[Any]:

@@ -1,7 +1,6 @@
 """What a chain of samples says about the parameters of a fit: estimates, predictions, and how far to trust them."""
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, cast
@@ -14,26 +13,23 @@ from jax import Array
 from fits._lazy import shown_by
 from fits.data.geometry import Floats
 from fits.optimise.result import Fit
-from fits.problem.discrepancy import logarithm
+from fits.problem.discrepancy import Correlation, logarithm
 from fits.problem.model import Model
 from fits.sampling.chain import Chain
 from fits.sampling.convergence import Convergence, after_burn_in
 from fits.sampling.mixture import Mixture
 from fits.sampling.options import SamplerOptions
-from layerjax._checks import require_kind
 
 if TYPE_CHECKING:
     from arviz import InferenceData
 
 REPORTED_DRAWS = 2048
-MODE_STEPS = 1000
-"""Steps of a chain by which shares of modes are estimated."""
+MODE_STEPS = 1000  # of a chain, by which shares of modes are estimated
 
 
 @dataclass(frozen=True)
 class Mode:
-    """A mode of a posterior: the share of it, its standard error as walkers scatter about it, and the mean of the
-    parameters there, by name."""
+    """A mode of a posterior: its share, the standard error of that as walkers scatter, the mean parameters by name."""
 
     share: float
     error: float
@@ -49,13 +45,12 @@ class Posterior:
         log_probability: (steps, walkers), of the unconstrained coordinates, not normalised.
         autocorrelation_time: (P,), in steps, of the chain without its burn-in.
         acceptance: mean share of proposals taken; of NUTS, of steps that moved.
-        converged: without its burn-in the chain is as long as `options` ask for in autocorrelation times of every
-            parameter, and R-hat as near to 1.
+        converged: the chain is as long in autocorrelation times, and R-hat as near to 1, as `options` ask for.
         allow_unconverged: estimates may be had from a chain that has not converged.
         status: what is to be said of the sampler, if anything.
         divergences: trajectories of NUTS, after its warm-up, whose energy diverged.
-        modes: where the fit knows several minima that hold a share of the posterior: these, the largest share first.
-            Estimates are of all of them together. Empty where one is known.
+        modes: the minima of the fit that hold a share of the posterior, the largest first, if there are several.
+            Estimates are of all of them together.
         options: that it was sampled with.
     """
 
@@ -85,9 +80,8 @@ class Posterior:
         fit = self.fit.part(name)
         own = list(self.fit.problem.places(name))
         whole = {plain: self.names[place] for plain, place in zip(fit.problem.names, own, strict=True)}
-        modes = tuple(
-            replace(mode, values={plain: mode.values[name] for plain, name in whole.items()}) for mode in self.modes
-        )
+        values = [{plain: mode.values[name] for plain, name in whole.items()} for mode in self.modes]
+        modes = tuple(replace(mode, values=its) for mode, its in zip(self.modes, values, strict=True))
         time = self.autocorrelation_time[own]
         return replace(self, fit=fit, chain=self.chain[..., own], autocorrelation_time=time, modes=modes)
 
@@ -135,9 +129,9 @@ class Posterior:
         """
         self._require_converged()
         kept = after_burn_in(self.chain, self.options).reshape(-1, len(self.names))
-        median, low, high = np.quantile(kept, [0.5, 0.158655, 0.841345], axis=0)
-        rows = np.stack([median, low, high, kept.mean(axis=0), kept.std(axis=0)], axis=-1).tolist()
-        return {name: (row[0], row[1], row[2], row[3], row[4]) for name, row in zip(self.names, rows, strict=True)}
+        quantiles = np.quantile(kept, [0.5, 0.158655, 0.841345], axis=0)
+        columns = np.stack([*quantiles, kept.mean(axis=0), kept.std(axis=0)], axis=-1).tolist()
+        return {name: tuple(row) for name, row in zip(self.names, columns, strict=True)}
 
     @cached_property
     def inference_data(self) -> "InferenceData":
@@ -236,11 +230,8 @@ def _over_samples(model: Model, vectors: Array, white: Array) -> tuple[Array, Ar
     def one(row: tuple[Array, Array]) -> tuple[Array, Array, Array]:
         vector, numbers = row
         predicted = expected = model.predict(vector)
-        if model.process is not None:
-            at = model.build(vector).correlation
-            assert at is not None
-            assert model.softness is not None
-            discrepancy = model.process.sample(numbers, at)
+        if model.process is not None and model.softness is not None:
+            discrepancy = model.process.sample(numbers, cast(Correlation, model.build(vector).correlation))
             expected = model.softness * jnp.sinh(logarithm(predicted, model.softness) + discrepancy)
         return model.log_likelihood_per_datum_at(vector, predicted), expected, model.sigma_at(vector, expected)
 
@@ -249,10 +240,3 @@ def _over_samples(model: Model, vectors: Array, white: Array) -> tuple[Array, Ar
 
 def _constrained(model: Model, positions: Array) -> Array:
     return jax.vmap(model.box.constrain)(positions)
-
-
-def require_fits(candidates: object) -> None:
-    """Refuse what are no fits or posteriors by name."""
-    require_kind("candidates", candidates, Mapping)
-    for name, one in cast(Mapping[str, object], candidates).items():
-        require_kind(f"candidates[{name!r}]", one, Fit, Posterior)

@@ -16,14 +16,10 @@ from scipy import stats
 from fits.data.geometry import Floats
 from fits.sampling.mixture import NARROWEST, Mixture
 
+# normal scores of the quantiles between which marginal distributions are mapped; the last slopes go on beyond
 SCORES = np.linspace(-2.0, 2.0, 17)
-"""Normal scores of the quantiles between which marginal distributions are mapped; the last slopes go on beyond."""
-
-LINEAR_SHARE = 0.02
-"""Of a map: the linear one, by mean and deviation, without which equal draws would have no slope."""
-
-INITIAL_SHARE = 0.1
-"""Of proposals: those from the approximations of the fit, which know of modes that were not visited."""
+LINEAR_SHARE = 0.02  # of a map: the linear one, by mean and deviation, without which equal draws would have no slope
+INITIAL_SHARE = 0.1  # of proposals: those from the approximations of the fit, which know of modes not visited
 
 
 class Density(Protocol):
@@ -44,10 +40,8 @@ def propose(density: Density, positions: Floats, generator: np.random.RandomStat
 
 @dataclass(frozen=True, eq=False)
 class FittedProposal:
-    """A density fitted to draws of a posterior, with a share of another, if there is one.
-
-    quantiles: (P, K), at `SCORES`. copula: the mixture of normal scores.
-    """
+    """A density fitted to draws of a posterior, by quantiles (P, K) at `SCORES` and a mixture of normal scores, with a
+    share of another, if there is one."""
 
     quantiles: Floats
     copula: Mixture

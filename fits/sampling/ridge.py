@@ -26,11 +26,8 @@ TINY = 1e-300
 
 
 class Ridge(NamedTuple):
-    """Points of a ridge of a problem with P parameters, and what is known there.
-
-    points: (M, P), of the unit box. rows: (M, R, P), of information, in boxes^-1. bounds: (M, D, P), more rows, which
-    keep the D directions that are open from reaching beyond the next point.
-    """
+    """Points of a ridge, (M, P), of the unit box; rows of information there, (M, R, P), in boxes^-1; and more of them,
+    (M, D, P), which bound the D directions that are open at the next point."""
 
     points: Floats
     rows: Floats
@@ -51,10 +48,11 @@ class _Known(NamedTuple):
 
 
 def ridge(problem: Problem, optimum: Floats, free: NDArray[np.bool_]) -> Ridge:
-    """Points of the unit box that do nearly as well as the optimum (P,), itself the first.
+    """Points of the unit box that do nearly as well as the optimum (P,), which is the first, or alone without an open
+    direction. free: (P,) bool, the others stay.
 
-    That one alone where no direction is open. From every point steps are taken along the directions that are open
-    there, and brought back to where the data want them, until the ridge is full. free: (P,) bool, the others stay.
+    From every point steps are taken along the directions that are open there, and brought back to where the data want
+    them, until the ridge is full.
     """
     best = _Known.at(problem, _place(optimum))
     dimension = len(open_directions(best.rows[:, free]))

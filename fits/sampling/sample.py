@@ -1,7 +1,4 @@
-"""Sampling the posterior about a fit, until the chain is long enough to be believed.
-
-Chains move in unconstrained coordinates, where the box has no walls; everything that is reported is physical.
-"""
+"""Sampling the posterior about a fit, in unconstrained coordinates, until the chain is long enough to be believed."""
 
 import time
 from dataclasses import asdict, replace
@@ -16,7 +13,7 @@ from scipy.stats import qmc
 from fits._files import given_path, require_switch
 from fits.optimise.result import Fit
 from fits.problem.problem import Problem
-from fits.progress import Progress
+from fits.progress import Progress, given_progress, silent
 from fits.sampling.chain import Chain, opened
 from fits.sampling.convergence import CHECKS, Convergence, expected_steps, next_check
 from fits.sampling.ensemble import Ensemble
@@ -29,8 +26,7 @@ from layerjax._checks import require_kind, require_seed
 from layerjax.compiling import programs_kept
 
 WALKERS = 32
-PATIENCE = 10.0
-"""Seconds between two looks at a chain that grows slowly, for what progress shows."""
+PATIENCE = 10.0  # seconds between two looks at a chain that grows slowly, for what progress shows
 
 Sampler = Literal["emcee", "nuts"]
 
@@ -55,8 +51,8 @@ def sample(
     Args:
         fit: made with a likelihood.
         ess, walkers, max_steps: those of `options`, in their place.
-        sampler: "emcee", an ensemble of walkers that move together, or "nuts", a few chains that follow the gradient,
-            for many parameters: it needs the extra `layerjax[nuts]`.
+        sampler: "emcee", an ensemble of walkers, or "nuts", a few chains that follow the gradient, for many parameters:
+            it needs the extra `layerjax[nuts]`.
         options: when sampling ends, and how; a chain may be gone on with for more effective samples.
         seed: random seed; the same seed gives the same chain.
         path: file that the chain is kept in as it grows: a killed run that is started again resumes, and ends as it
@@ -67,33 +63,33 @@ def sample(
             ("warm-up", steps, all).
 
     Raises:
-        ValueError: the fit's objective is no likelihood, or it is a part of one of several measurements, whose chain is
-            that of the whole (`Posterior.part`); too few walkers; an unknown sampler, or one whose extra is not
-            installed; `path` holds a chain of something else, or is in use by another process; no start with a finite
-            posterior near the optimum.
+        ValueError: the fit's objective is no likelihood, or it is a part of a joint one, whose chain is that of the
+            whole (`Posterior.part`); too few walkers; an unknown sampler, or one whose extra is not installed; `path`
+            holds a chain of something else, or is in use by another process; no finite posterior near the optimum.
         OSError: the disk is full, say. What was sampled is kept.
     """
     require_kind("fit", fit, Fit)
-    if not fit.is_posterior:
-        raise ValueError(f"objective {fit.problem.objective!r} is no likelihood, so there is no posterior to sample")
-    fit.require_alone("sample")
+    fit.require_posterior("sample")
     require_seed(seed)
     require_switch("resume", resume)
     require_switch("allow_unconverged", allow_unconverged)
     if path is not None and not given_path("path", path).parent.is_dir():
         raise ValueError(f"{path}: there is no directory {Path(path).parent}")
     count = len(fit.problem.names)
-    options = settings(count, sampler, options, ess=ess, walkers=walkers, max_steps=max_steps)
-    assert options.walkers is not None
-    identity = identity_of(fit.problem, options.walkers, seed, sampler)
-    with opened(path, options.walkers, count, identity, resume) as chain:
+    require_kind("options", options, SamplerOptions, None)
+    changes: dict[str, Any] = {"ess": ess, "walkers": walkers, "max_steps": max_steps}
+    options = replace(options or SamplerOptions(), **{name: one for name, one in changes.items() if one is not None})
+    walkers = walkers_of(count, sampler, options.walkers)
+    options = replace(options, walkers=walkers)
+    progress = given_progress(progress)
+    with opened(path, walkers, count, identity_of(fit.problem, walkers, seed, sampler), resume) as chain:
         chain.keep_options(asdict(options))
         moved = Nuts(fit, chain, seed, options, progress) if sampler == "nuts" else Ensemble(fit, chain, seed, options)
         _run(moved, chain, options, progress)
     return posterior_of(fit, chain, allow_unconverged)
 
 
-def _run(moved: Nuts | Ensemble, chain: Chain, options: SamplerOptions, progress: Progress | None) -> None:
+def _run(moved: Nuts | Ensemble, chain: Chain, options: SamplerOptions, progress: Progress) -> None:
     """Go on until the chain is long enough, as seen at its checks."""
     found, looked = Convergence.of(chain.steps(), options), time.monotonic()
     total: int | None = None
@@ -101,11 +97,11 @@ def _run(moved: Nuts | Ensemble, chain: Chain, options: SamplerOptions, progress
     def check() -> None:
         nonlocal found, total, looked
         found = Convergence.of(chain.steps(), options)
-        total = None if progress is None else expected_steps(chain.steps(), options)
+        total = None if progress is silent else expected_steps(chain.steps(), options)
         looked = time.monotonic()
 
     def show() -> None:
-        if progress is None:
+        if progress is silent:
             return
         if time.monotonic() - looked > PATIENCE:
             check()
@@ -121,31 +117,20 @@ def _run(moved: Nuts | Ensemble, chain: Chain, options: SamplerOptions, progress
     show()
 
 
-def settings(
-    count: int,
-    sampler: Sampler,
-    options: SamplerOptions | None = None,
-    *,
-    ess: float | None = None,
-    walkers: int | None = None,
-    max_steps: int | None = None,
-) -> SamplerOptions:
-    """The options that so many parameters are sampled with. ValueError for those by which they cannot be."""
-    require_kind("options", options, SamplerOptions, None)
-    changes: dict[str, Any] = {"ess": ess, "walkers": walkers, "max_steps": max_steps}
-    options = replace(options or SamplerOptions(), **{name: one for name, one in changes.items() if one is not None})
+def walkers_of(count: int, sampler: Sampler, walkers: int | None) -> int:
+    """How many walkers sample so many parameters. ValueError for a number with which they cannot be."""
     if sampler not in get_args(Sampler):
         raise ValueError(f"sampler is {sampler!r}; it must be one of {', '.join(get_args(Sampler))}")
     if sampler == "nuts":
         require_blackjax()
-        if options.walkers is not None and options.walkers < 2:
-            raise ValueError(f"walkers is {options.walkers}; it must be at least 2 for sampler='nuts'")
-        return replace(options, walkers=options.walkers or CHAINS)
+        if walkers is not None and walkers < 2:
+            raise ValueError(f"walkers is {walkers}; it must be at least 2 for sampler='nuts'")
+        return walkers or CHAINS
     least = 2 * count + 2
-    walkers = options.walkers or max(WALKERS, least)
+    walkers = walkers or max(WALKERS, least)
     if walkers % 2 or walkers < least:
         raise ValueError(f"walkers is {walkers}; it must be even and at least {least} for {count} parameters")
-    return replace(options, walkers=walkers)
+    return walkers
 
 
 class NoSteps(ValueError):
@@ -174,11 +159,9 @@ def settings_of(store: Store) -> tuple[str, int, int]:
     return whose.get("sampler", "none"), int(whose.get("walkers", 0)), int(whose.get("seed", 0))
 
 
-def identity_of(problem: Problem, walkers: int, seed: int, sampler: str = "emcee") -> dict[str, str]:
-    """What tells one sampling from another: names, bounds, settings, and the posterior itself at a few points.
-
-    Of numbers the first digits, which are the same wherever they are computed.
-    """
+def identity_of(problem: Problem, walkers: int, seed: int, sampler: str) -> dict[str, str]:
+    """What tells one sampling from another: names, bounds, settings, and the posterior itself at a few points; of
+    numbers the first digits, which are the same wherever they are computed."""
     points = 0.01 + 0.98 * qmc.Sobol(len(problem.names), scramble=False).random_base2(2)  # in the unit box
     log_posterior = log_posteriors(problem, logit(points), share_of(walkers))
     return fingerprint(

@@ -13,6 +13,7 @@ from scipy.optimize import least_squares
 import fits
 import layerjax as lj
 from fits.maps.report import summarise, verdict
+from fits.problem.model import Model
 from tests.helpers import quick_maps
 from tests.helpers.quick_maps import FREE, NAMES, NOISE, TRANSPORT, assert_same, fitted
 
@@ -53,8 +54,12 @@ def test_every_texel_ends_where_scipy_does_and_others_are_flagged(partial, geome
     for place in ((0, 0), (0, 1), (7, 0)):
         noise, data = replace(NOISE, floor=partial.attributes["pilot"]["floor"]), data_of(geometry, holes[0][place])
         problem = fits.Problem(FREE, data, transport=TRANSPORT, noise=noise)
+
+        def residuals(vector, problem=problem):
+            return np.concatenate([np.ravel(part) for part in problem.call(Model.residuals, vector)])
+
         best = least_squares(
-            lambda vector, problem=problem: np.asarray(problem.residuals(vector)), [0.5, 0.4],
+            residuals, [0.5, 0.4],
             bounds=([0.05, 0.0], [3.0, 1.0]), xtol=1e-12, ftol=1e-14, gtol=1e-12,
         )  # fmt: skip
         for name, value in zip(NAMES, best.x, strict=True):

@@ -241,7 +241,7 @@ def test_bad_requests_are_refused(found: Fit, flat: Fit) -> None:
         (lambda: average(two, {"line": -1.0, "flat": 2.0}), "a number of at least 0"),
         (lambda: average({}), "there is no fit to average"),
         (lambda: cross_validate(named), "a fit of 'cube_root' has no noise model"),
-        (lambda: evidence(named), "a fit of 'cube_root' has none"),
+        (lambda: evidence(named), "a fit of 'cube_root' has no noise model"),
         (lambda: cross_validate(few), "too few measurements to hold some"),
     ):
         with pytest.raises(ValueError, match=message):

@@ -9,7 +9,7 @@ import pytest
 
 from fits import Fit, Posterior, load_posterior, sample, save_fit
 from fits.sampling.nuts import Nuts, _step
-from fits.sampling.sample import load, settings
+from fits.sampling.sample import load, walkers_of
 
 pytest.importorskip("blackjax")
 
@@ -68,7 +68,7 @@ def test_it_goes_on_from_its_file_to_the_same_end(result: Fit, short: Posterior,
 
 
 def test_chains_and_extra_are_there(result: Fit, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert settings(20, "nuts").walkers == 4
+    assert walkers_of(20, "nuts", None) == 4
     with pytest.raises(ValueError, match="walkers is 1; it must be at least 2"):
         sample(result, sampler="nuts", walkers=1)
     monkeypatch.setitem(sys.modules, "blackjax", None)

@@ -16,7 +16,7 @@ import pytest
 from scipy import stats
 
 from fits import Fit, Free, SamplerOptions, fit, sample
-from fits.sampling.sample import load, settings
+from fits.sampling.sample import load, walkers_of
 from fits.store import Store
 from tests.helpers.models import COUNT, design, line, line_data, line_fit, student_fit
 from tests.helpers.places import ROOT
@@ -84,7 +84,7 @@ def test_options_are_kept_with_the_chain(result: Fit, tmp_path: Path) -> None:
     assert posterior.options == options
     assert posterior.burn_in == len(posterior.chain) // 4
     assert load(result, tmp_path / "chain").options == options
-    assert settings(20, "emcee").walkers == 42  # more than twice as many as parameters
+    assert walkers_of(20, "emcee", None) == 42  # more than twice as many as parameters
 
 
 def test_a_parameter_on_its_bound_has_a_truncated_posterior() -> None:
@@ -219,7 +219,7 @@ def test_free_student_noise_is_sampled() -> None:
         ({"walkers": 4}, "walkers is 4; it must be even and at least 6"),
         ({"ess": 0.0}, r"ess is 0.0; it must be a number in \(0, inf\)"),
         ({"max_steps": 10}, "max_steps: 10 is not a whole number of at least 100"),
-        ({"objective": "cosine_l2"}, "'cosine_l2' is no likelihood, so there is no posterior"),
+        ({"objective": "cosine_l2"}, "sample: a fit of 'cosine_l2' has no noise model, and so no posterior"),
     ],
 )
 def test_refused(result: Fit, options: dict, message: str) -> None:
