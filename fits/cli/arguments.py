@@ -30,13 +30,7 @@ def _number(kind: type[int] | type[float], low: float, high: float = math.inf) -
 
 
 count, level, share = _number(int, 1), _number(float, 0.0), _number(float, 0.0, 1.0)
-angle, polar = _number(float, 0.0, 90.0), _number(float, 0.0, 180.0)
-
-
-def degrees(words: str) -> list[float]:
-    """Polar angles, separated by commas."""
-    return [polar(word) for word in words.split(",")]
-
+angle, polar, azimuth = (_number(float, *ends) for ends in ((0.0, 90.0), (0.0, 180.0), (-360.0, 360.0)))
 
 Settings = dict[str, Any]
 
@@ -50,6 +44,22 @@ def _several(what: str, metavar: str, **settings: Any) -> Settings:
     return _one(what, metavar, nargs="+", **{"default": ()} | settings)
 
 
+def _numbers(what: str, metavar: str, number: Callable[[str], Any], **settings: Any) -> Settings:
+    """Those of several numbers, with commas or spaces between them."""
+
+    def read(words: str) -> list[Any]:
+        return [number(word) for word in words.split(",")]
+
+    return _several(what, metavar, type=read, action=_Joined, **settings)
+
+
+class _Joined(argparse.Action):
+    """Keeps lists of numbers as one."""
+
+    def __call__(self, parser: Any, namespace: Any, values: Any, option_string: Any = None) -> None:
+        setattr(namespace, self.dest, [number for some in values for number in some])
+
+
 def _flag(what: str) -> Settings:
     return _one(what, action="store_true")
 
@@ -61,8 +71,8 @@ def _out(metavar: str, what: str = "file to write", required: bool = True) -> Se
 DATA = _one("measurements: csv, MERL .binary, .bsdf and others, see docs/formats.md", "DATA")
 RESULT = _one("result directory of `layerjax fit`", "DIR")
 MATERIAL = _one("result directory, stack (free parameters at their start), or material of the gallery", "DIR|TOML|NAME")
-INCIDENCE = _several("polar angles of the light", "DEG", type=degrees)
-AZIMUTH = _several("planes; 0 is that of incidence (default)", "DEG", type=float)
+INCIDENCE = _numbers("polar angles of the light", "DEG", polar)
+AZIMUTH = _numbers("planes; 0 is that of incidence (default)", "DEG", azimuth)
 READ_HELP = (
     "options of the reader: format=merl; quantity=brdf, brdf_cos or reflectance_factor; bins=5000 or all, strata=flux "
     "(MERL, RGL); wavelengths=600,620 in nm, corrected=yes or no (.rxt); default: as the file says"
@@ -219,7 +229,7 @@ COMMANDS = {
         "layerjax simulate --stack coat.toml --incidence 10,30,50,70 --noise 0.05 --out simulated.csv",
         {
             "--out": _out("CSV", "file to write; its name ends in .csv"),
-            "--incidence": INCIDENCE | {"default": ([10, 30, 50, 70],)},
+            "--incidence": INCIDENCE | {"default": (10, 30, 50, 70)},
             "--azimuth": AZIMUTH | {"default": (0,)},
         },
         "--stack --noise --seed --force",
@@ -245,8 +255,8 @@ COMMANDS = {
             "material": MATERIAL,
             "--to": _one("rgl: Mitsuba's and pbrt's tensor file; openpbr: MaterialX", choices=EXPORTS, required=True),
             "--out": _out("FILE"),
-            "--wavelengths": _several(
-                "of the channels, for a spectral rgl file", "NM", type=_number(float, 1.0, 1e9), default=None
+            "--wavelengths": _numbers(
+                "of the channels, for a spectral rgl file", "NM", _number(float, 1.0, 1e9), default=None
             ),
         },
         "--force",

@@ -106,7 +106,7 @@ def predict(arguments: Namespace) -> int:
         found = run_prediction(source, data)
         show(tables.scores_table(found, data, f"Prediction of {arguments.score}"))
     else:
-        found = run_prediction(source, slices(np.concatenate(arguments.incidence), azimuth=arguments.azimuth or (0,)))
+        found = run_prediction(source, slices(arguments.incidence, azimuth=arguments.azimuth or (0,)))
     if out is not None:
         write_text(out, tables.prediction_csv(found), force=arguments.force)
         show(
@@ -272,7 +272,7 @@ def simulate(arguments: Namespace) -> int:
     from fits.problem.stack_file import read_problem
 
     given = read_problem(arguments.stack)
-    geometry = slices([theta for several in arguments.incidence for theta in several], azimuth=arguments.azimuth)
+    geometry = slices(arguments.incidence, azimuth=arguments.azimuth)
     how = {"transport": given.transport, "noise": arguments.noise, "seed": arguments.seed}
     data = run_simulation(at_start(given.stack), geometry, **how)
     return _write_measurements(data, arguments)

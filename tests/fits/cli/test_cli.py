@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import layerjax as lj
-from fits import Problem, load_fit, load_posterior, read, save_fit
+from fits import Problem, load_fit, load_posterior, read, save_fit, slices
 from fits.cli import commands
 from fits.cli.arguments import COMMANDS
 from fits.cli.parser import main
@@ -161,9 +161,10 @@ def test_info_says_what_is_there_and_draws_it(work, monkeypatch, layerjax):
 def test_convert_and_simulate_write_csv(work, coat_data, layerjax):
     layerjax("convert data.csv copy.csv")
     np.testing.assert_array_equal(read(work / "copy.csv").values, coat_data.values)
-    layerjax("simulate --stack coat.toml --incidence 20 40 --noise 0.1 --out new.csv --seed 3")
+    layerjax("simulate --stack coat.toml --incidence 20,40 --azimuth 0 90,45 --noise 0.1 --out new.csv --seed 3")
     first = read(work / "new.csv")
     assert sorted(set(first.theta_i)) == [20.0, 40.0]
+    assert len(first.wi) == len(slices([20.0, 40.0], azimuth=[0.0, 90.0, 45.0]).wi)
     # Lambertian paint alone would be albedo / pi = 0.159; the coat's start values darken it
     assert 0.02 < float(np.median(first.values)) < 0.16
 
