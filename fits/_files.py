@@ -15,8 +15,7 @@ from typing import Any
 import numpy as np
 
 CHECKSUM = "checksum"
-PARTIAL = ".partial"
-"""How names of directories end, here and in zarr, that have not been written to their end."""
+PARTIAL = ".partial"  # how names of directories end, here and in zarr, that have not been written to their end
 _UMASK = os.umask(0)  # it can only be read by setting it: once, before other threads make files
 os.umask(_UMASK)
 

@@ -23,14 +23,11 @@ from itertools import islice
 from multiprocessing import current_process
 from typing import Any, NamedTuple
 
-TIMEOUT = 60.0
-"""Seconds to wait for the first worker."""
+TIMEOUT = 60.0  # seconds to wait for the first worker
 
-FULL = (errno.ENOSPC, errno.EDQUOT)
-"""Errors of a full disk, which affect every task."""
+FULL = (errno.ENOSPC, errno.EDQUOT)  # errors of a full disk, which affect every task
 
-SCRIPT_REPEATED = 78
-"""Exit code of a worker that runs its parent's script to the point where that starts workers."""
+SCRIPT_REPEATED = 78  # exit code of a worker that runs its parent's script to the point where that starts workers
 
 Work = Callable[[Any, Any], Any]
 

@@ -37,8 +37,7 @@ import numpy as np
 
 from fits._files import locked, named, require_there
 
-APPLICATION = 0x6C6A7802
-"""SQLite's application_id of a store; its last digits are the version of the layout."""
+APPLICATION = 0x6C6A7802  # SQLite's application_id of a store; its last digits are the version of the layout
 _LAYOUT = """
 CREATE TABLE records (number INTEGER PRIMARY KEY, key TEXT, checksum INTEGER, text TEXT);
 """

@@ -44,8 +44,7 @@ from layerjax._numerics import broadcasting
 from layerjax.compiling import programs_kept
 
 STORE = "search.store"
-TOGETHER = 8
-"""Structures at a time, at most: as many programs as a process can hold beside those that it has."""
+TOGETHER = 8  # structures at a time, at most: as many programs as a process can hold beside those that it has
 
 Structure = tuple[str, ...]
 """Names of layers from top to bottom, and of the base."""

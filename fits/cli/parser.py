@@ -16,8 +16,7 @@ from typing import Any
 from fits.cli.arguments import build_parser
 from fits.engines import one_line
 
-MAX_MESSAGE = 1000
-"""Characters of an error that are shown: JAX adds a table of all arrays to one of memory."""
+MAX_MESSAGE = 1000  # characters of an error that are shown: JAX adds a table of all arrays to one of memory
 
 
 def main(argv: Sequence[str] | None = None) -> int:

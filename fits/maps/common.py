@@ -24,11 +24,9 @@ from fits.problem.problem import Problem, unit
 
 Floats = NDArray[np.float64]
 
-MOST_ROUNDS, HALVINGS = 30, 8
-"""Gauss-Newton steps, and how often one that does not help is halved."""
+MOST_ROUNDS, HALVINGS = 30, 8  # Gauss-Newton steps, and how often one that does not help is halved
 
-CLOSE = 0.01
-"""Standard errors that a last step may be long."""
+CLOSE = 0.01  # standard errors that a last step may be long
 
 
 def with_common(problem: Problem, values: Mapping[str, float]) -> Problem:

@@ -36,14 +36,12 @@ CORNERS, LINE_NODES, CHECKS, ROUNDS = 12, 33, 64, 3
 OFFSET = 1.0
 """Multiple of a datum's mean over the box that is added before the logarithm, whose series is then shortest."""
 
-LOGARITHMIC_ABOVE = 5.0
-"""Ratio of the bounds of a parameter from which its logarithm is the coordinate."""
+LOGARITHMIC_ABOVE = 5.0  # ratio of the bounds of a parameter from which its logarithm is the coordinate
 
 MORE = 1.25
 """Times as many terms are taken where an emulator does not hold, and so many fewer at first than the lines ask for."""
 
-SHARE = 64
-"""Solutions that one call of a program finds."""
+SHARE = 64  # solutions that one call of a program finds
 
 
 # ---- as a model ----

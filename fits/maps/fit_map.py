@@ -37,8 +37,7 @@ from layerjax.compiling import programs_kept
 if TYPE_CHECKING:
     from fits.data.geometry import Geometry
 
-NAMED = 8
-"""Chunks that an error names of those that could not be done."""
+NAMED = 8  # chunks that an error names of those that could not be done
 
 
 @programs_kept()

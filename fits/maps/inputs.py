@@ -27,15 +27,13 @@ from fits.store import fingerprint
 Block = tuple[slice, ...]
 """A selection of the leading axes of a map, the first ones of an array; other axes are taken whole."""
 
-SAMPLE, CHANNEL = "sample", "channel"
-"""Names of the axes of measurements and of channels in xarray."""
+SAMPLE, CHANNEL = "sample", "channel"  # names of the axes of measurements and of channels in xarray
 
 VECTORS, ANGLES = ("wi", "wo"), ("theta_i", "phi_i", "theta_o", "phi_o")
 FILES = (".npy", ".h5", ".hdf5", ".zarr")
 NORMAL = (0.0, 0.0, 1.0)
 
-WHOLE, SOME = 2**23, 64
-"""Numbers of a map that is fingerprinted as a whole; and texels that are of a larger one."""
+WHOLE, SOME = 2**23, 64  # numbers of a map that is fingerprinted as a whole; and texels that are of a larger one
 
 
 # ---- arrays, wherever they are ----

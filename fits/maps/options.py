@@ -13,8 +13,7 @@ from fits.progress import Progress, given_progress, silent
 from layerjax._checks import require_choice, require_count, require_kind, require_number
 
 Kind = Literal["gaussian", "total_variation"]
-SCALES = 1e-6, 1e6
-"""Scales of a spatial prior, as shares of a parameter's bounds."""
+SCALES = 1e-6, 1e6  # scales of a spatial prior, as shares of a parameter's bounds
 
 
 @dataclass(frozen=True)

@@ -20,11 +20,9 @@ from fits.problem.problem import Problem
 
 Floats = NDArray[np.float64]
 
-FIRST = 8
-"""Texels of the pilot that are fitted from all starts; the rest of it begins where these ended."""
+FIRST = 8  # texels of the pilot that are fitted from all starts; the rest of it begins where these ended
 
-MOST_PREDICTED = 4
-"""Starts that are compared for every texel, where each has directions of its own."""
+MOST_PREDICTED = 4  # starts that are compared for every texel, where each has directions of its own
 
 
 @dataclass(frozen=True)

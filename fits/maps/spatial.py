@@ -28,8 +28,7 @@ from fits.maps.texels import fit_texels, standard_errors, to_units, widths
 Floats = NDArray[np.float64]
 Truths = NDArray[np.bool_]
 
-FLAT = 0.1
-"""Of the scale: below, a difference counts by its square in a total variation, which has no derivative at 0."""
+FLAT = 0.1  # of the scale: below, a difference counts by its square in a total variation, which has no derivative at 0
 
 
 def neighbour_prior(kind: Kind, scales: Floats, units: Floats, fitted: Truths) -> tuple[Floats, Floats]:

@@ -30,17 +30,14 @@ Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Truths = NDArray[np.bool_]
 
-OMITTED = 1e9
-"""Standard deviation of a value that is omitted, in units of the largest: it weighs less than rounding."""
+OMITTED = 1e9  # standard deviation of a value that is omitted, in units of the largest: it weighs less than rounding
 
-LANES = 4
-"""Texels that take their steps side by side: more do not make the arithmetic of each cheaper."""
+LANES = 4  # texels that take their steps side by side: more do not make the arithmetic of each cheaper
 
 LAST = 0.01
 """Of the decrease that a full step may have left at the end: so much is left after a last step, not evaluated."""
 
-KNOWN = 64
-"""Starts whose linearisation a program takes, or a multiple of that, so that there are few programs."""
+KNOWN = 64  # starts whose linearisation a program takes, or a multiple of that, so that there are few programs
 
 
 # ---- measurements of texels ----

@@ -36,13 +36,8 @@ from fits.sampling.proposals import Density
 from layerjax._checks import in_short, require_count, require_kind, require_number, require_seed
 from layerjax.compiling import programs_kept
 
-LEVELS = (
-    0.025,
-    0.25,
-    0.5,
-    0.75,
-    0.975,
-)  # quantiles of a `Summary`: ends of the central 50 % and 95 % intervals, median
+# quantiles of a `Summary`: the ends of the central 50 % and 95 % intervals, and the median
+LEVELS = (0.025, 0.25, 0.5, 0.75, 0.975)
 COVERAGES = (0.5, 0.95)  # central intervals whose coverage is scored
 DRAWS = 256  # draws of the posterior that a prediction is made with
 MIN_PROPOSALS = 400  # the fewest weighted draws that those of a fit's posterior are resampled from

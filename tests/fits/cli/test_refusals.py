@@ -84,7 +84,10 @@ MAP, MANY = "fit-map map.npy --stack coat.toml --out coat.zarr", "fit-many scans
         (f"{FIT} --min-retro-angle nan", "nan given, must be a number in [0, 90]"),
         ("simulate --stack coat.toml --incidence 95.5 200 --out x.csv", "200 given, must be a number in [0, 180]"),
         ("simulate --stack coat.toml --azimuth 0,x --out x.csv", "'x' given, must be a number in [-360, 360]"),
-        ("export coat.toml --to rgl --wavelengths 450,1e300 --out x.bsdf", "1e300 given, must be a number in [1, 1e+09]"),
+        (
+            "export coat.toml --to rgl --wavelengths 450,1e300 --out x.bsdf",
+            "1e300 given, must be a number in [1, 1e+09]",
+        ),
         ("simulate --stack coat.toml --out x.csv --noise -1", "-1 given, must be a number in [0, 1]"),
         (f"{MANY} --processes 2 --scheduler tcp://x:1", "--scheduler: not allowed with argument --processes"),
         (f"{MAP} --spatial-prior wide", "invalid choice: 'wide'"),
