@@ -1,20 +1,17 @@
-"""Many data sets of one problem, fitted in one compiled program."""
+"""Many data sets of one problem, fitted by the same compiled programs."""
 
 from dataclasses import replace
 from typing import NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
 from numpy.typing import ArrayLike, NDArray
 
-from fits.optimise.levenberg_marquardt import COST_TOLERANCE, descend
+from fits.optimise.levenberg_marquardt import descent
 from fits.optimise.multi_start import MOST_STEPS, start_points
 from fits.optimise.resolution import resolutions
-from fits.problem.compilation import cores, in_shares
-from fits.problem.model import Model
+from fits.problem.compilation import on_all_cores
 from fits.problem.problem import Problem
 
 Floats = NDArray[np.float64]
@@ -30,7 +27,7 @@ class Repeats(NamedTuple):
 
 
 def fit_many(problem: Problem, values: ArrayLike, *, starts: int = 1, seed: int = 0) -> Repeats:
-    """Fit K data sets (K, N, C) in the place of the problem's used values, in one compiled program.
+    """Fit K data sets (K, N, C) in the place of the problem's used values, by the same compiled programs.
 
     Args:
         problem: gives the stack, the directions and the noise. A transport without a resolution of its own takes that
@@ -52,26 +49,19 @@ def fit_many(problem: Problem, values: ArrayLike, *, starts: int = 1, seed: int 
     expected = problem.model.values.shape
     if values.ndim != 3 or values.shape[1:] != expected:
         raise ValueError(f"values has shape {values.shape}; it must be (K, {expected[0]}, {expected[1]})")
-    points = start_points(problem, starts, seed)
-    workers = max(1, min(cores(), len(values)))
-    share = -(-len(values) // (4 * workers)) if workers > 1 else len(values)
-    return Repeats(*in_shares(lambda part: problem.call(_solve_repeats, points, part), values, share))
-
-
-def _solve_repeats(model: Model, starts: Array, values: Array) -> tuple[Array, Array, Array, Array]:
+    points, model, _ = start_points(problem, starts, seed), problem.model, problem.without_discrepancy
     if model.process is not None and model.process.projection is not None:  # that of the problem's own values
         model = replace(model, process=replace(model.process, projection=None))
+    slopes = np.asarray(model.box.prior_slopes())
 
-    def one(row: Array) -> tuple[Array, Array, Array, Array]:
-        repeat = eqx.tree_at(lambda m: m.values, model, row)
-        most, tolerance = jnp.asarray(MOST_STEPS), jnp.asarray(COST_TOLERANCE)
-        outcomes = jax.lax.map(lambda start: descend(repeat, start, jnp.asarray(True), most, tolerance), starts)
-        best = jax.tree.map(lambda part: part[jnp.argmin(outcomes.cost)], outcomes)
-        width = model.box.slope(best.vector)
-        slopes = model.box.prior_slopes()
-        covariance = jnp.linalg.pinv(best.root.T @ best.root + slopes.T @ slopes, hermitian=True)
-        if model.objective != "likelihood":
-            covariance = covariance * 2.0 * best.cost / max(row.size - width.size, 1)
-        return best.vector, jnp.sqrt(jnp.diagonal(covariance)) * width, best.cost, best.converged
+    def one(row: Floats) -> tuple[Floats, Floats, float, bool]:
+        own = problem.with_model(eqx.tree_at(lambda m: m.values, model, jnp.asarray(row)))
+        best = min((descent(own, point, True, MOST_STEPS) for point in points), key=lambda end: float(end.cost))
+        covariance = np.linalg.pinv(best.root.T @ best.root + slopes.T @ slopes, hermitian=True)
+        if problem.objective != "likelihood":
+            covariance = covariance * 2.0 * best.cost / max(row.size - len(best.vector), 1)
+        width = np.asarray(model.box.slope(jnp.asarray(best.vector)))
+        return best.vector, np.sqrt(np.diagonal(covariance)) * width, best.cost, best.converged
 
-    return jax.lax.map(one, values)
+    found = [one(values[0]), *on_all_cores(one, values[1:])]  # the first alone: it compiles the programs
+    return Repeats(*(np.array(part) for part in zip(*found, strict=True)))

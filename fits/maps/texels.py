@@ -7,7 +7,7 @@ each of these, which takes several times as long. At a start whose linearisation
 """
 
 from collections.abc import Callable
-from dataclasses import fields, replace
+from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -23,7 +23,7 @@ from fits.optimise.levenberg_marquardt import COST_TOLERANCE, FIRST_DAMPING, NEA
 from fits.optimise.levenberg_marquardt import step as step_of
 from fits.optimise.multi_start import MOST_STEPS
 from fits.optimise.uncertainty import LARGEST_ERROR, LEAST_GRADIENT, ON_BOUND, UNIDENTIFIED_BEYOND, UNKNOWN_BEYOND
-from fits.problem.model import Model
+from fits.problem.model import Linearisation, Model, linear, linearise
 from fits.problem.problem import Problem
 
 Floats = NDArray[np.float64]
@@ -124,13 +124,6 @@ def with_own_directions(problem: Problem) -> Problem:
 
 
 # ---- fits from a start each ----
-
-
-class Linearisation(NamedTuple):
-    """What a model says at a vector: values (N, C) in 1/sr, and derivatives (P, N, C) by the physical parameters."""
-
-    values: Any
-    slopes: Any
 
 
 class Fits(NamedTuple):
@@ -376,25 +369,9 @@ def first_mapped(one: Callable[[Any], Any], rows: Any, number: Array, otherwise:
     return jax.tree.map(lambda part: part.reshape(-1, *part.shape[2:]), found)
 
 
-class Linear(Model):
-    """A model near a vector `at` (P,), by what is known there."""
-
-    near: Linearisation
-    at: Array
-
-    def predict(self, vector: Array) -> Array:
-        """Scaled BSDF, (N, C), in 1/sr."""
-        return self.near.values + jnp.tensordot(vector - self.at, self.near.slopes, 1)
-
-
-def _linear(model: Model, known: Linearisation, vector: Array) -> Linear:
-    return Linear(**{one.name: getattr(model, one.name) for one in fields(Model)}, near=known, at=vector)
-
-
 def _linearise(model: Model, vector: Array) -> Linearisation:
-    """Values and derivatives at a vector (P,)."""
-    steps = jnp.eye(vector.size, dtype=vector.dtype)[: model.moving]
-    values, slopes = jax.vmap(lambda step: jax.jvp(model.predict, (vector,), (step,)), out_axes=(None, 0))(steps)
+    """Values at a vector (P,), and slopes by all parameters."""
+    values, slopes = linearise(model, vector)
     rest = jnp.zeros((vector.size - model.moving, *values.shape), values.dtype)
     return Linearisation(values, jnp.concatenate([slopes, rest]))
 
@@ -411,7 +388,7 @@ def _begin(model: Model, fresh: Array, start: tuple[Array, Texels]) -> _Run:
 
 def _step(model: Model, fresh: Array, most_steps: Array, run: _Run, row: Texels, trial: Linearisation) -> _Run:
     """A texel after a step by what is known of its trial."""
-    own = _linear(model_of(model, row), trial, model.box.from_unit(run.state.trial))
+    own = linear(model_of(model, row), trial, model.box.from_unit(run.state.trial))
     likelihood = model.objective == "likelihood"
     levels = likelihood and model.varying
     first_step = (jnp.where(run.rough, run.sigma, jnp.nan), jnp.ones(())) if levels else None
@@ -449,7 +426,7 @@ def _results(model: Model, run: _Run, row: Texels) -> Fits:
     """What is known where a texel ended."""
     own, unit, cost = model_of(model, row), run.state.point, run.state.cost
     vector, predicted, finite = model.box.from_unit(unit), run.state.auxiliary.values, jnp.isfinite(cost)
-    near = _linear(own, run.state.auxiliary, vector)
+    near = linear(own, run.state.auxiliary, vector)
     rows = jax.jacfwd(lambda unit: near.linear_parts(model.box.from_unit(unit))[1][1])(unit)
     misfit = jnp.where(row.used, own.standardised_at(vector, predicted), 0.0)
     return Fits(

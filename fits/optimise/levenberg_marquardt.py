@@ -8,8 +8,8 @@ and only J'J and J'r are kept, which is several times faster than a QR decomposi
 residuals than parameters. Columns are scaled to unit length first, so that units do not matter to the damping (after
 Marquardt 1963; its update after Nielsen 1999).
 
-To compile the Jacobian of a costly transport takes longer than most fits take to run. So whatever needs it, at one
-point or along many steps, calls `descend`: a descent of a single step says what is known where it begins.
+To compile the Jacobian of a costly transport takes longer than most fits take to run. So it is a program by itself,
+which fits with and without discrepancy share, and the others see the model as linear at a trial (`Problem.linearise`).
 """
 
 from collections.abc import Callable
@@ -23,7 +23,8 @@ import optimistix as optx
 from jax import Array
 
 from fits.data.geometry import Floats
-from fits.problem.model import Model
+from fits.problem.compilation import one_thread
+from fits.problem.model import Linearisation
 from fits.problem.problem import FittingProblem
 
 COST_TOLERANCE = 1e-8  # converged: a full step would gain less in the log-posterior, 1e-4 standard errors
@@ -274,70 +275,90 @@ class Descent(NamedTuple):
     predicted: Any = None
 
 
-def descend(model: Model, start: Array, fresh: Array, most_steps: Array, tolerance: Array) -> Descent:
-    """Levenberg-Marquardt from `start` (P,) in the unit box, until a full step is predicted to gain less than
-    `tolerance` in the log-posterior. Not `fresh`: near a minimum, all levels free."""
-    likelihood = model.objective == "likelihood"
-    varying = likelihood and bool(model.logarithmic)
-    options: dict[str, Any] = {
-        "watch": lambda auxiliary: auxiliary[1],
-        "damping": jnp.where(fresh, FIRST_DAMPING, NEARBY),
-        "tolerance": tolerance if likelihood else None,
-        "logarithmic": model.logarithmic if varying else (),
-    }
-
-    def residuals(unit: Array, first_step: tuple[Array, Array]) -> Any:
-        return model.linear_parts(model.box.from_unit(unit), first_step if varying else None)
-
-    def stage(unit: Array, held: tuple[Array, Array, Array]) -> tuple[Array, Descent]:
-        sigma, share, most = held
-        solution: Any = optx.least_squares(
-            residuals,
-            BoxLevenbergMarquardt(),
-            unit,
-            args=(sigma, share),
-            has_aux=True,
-            options=options | {"most_steps": most},
-            max_steps=None,
-            throw=False,
-        )
-        end: State = solution.stats["state"]
-        found = Descent(
-            vector=model.box.from_unit(end.point),
-            cost=end.cost,
-            steps=end.steps,
-            converged=end.ended & ~end.failed,
-            max_steps_reached=~end.ended,
-            gradient=end.gradient,
-            # R of the QR decomposition has A's singular values without squaring its condition number
-            root=jnp.linalg.qr(end.watched.T, mode="r"),
-            predicted=end.auxiliary[0],
-        )
-        return end.point, found
-
-    sigmas, most, shared = jnp.full((1, 1, 1), jnp.nan), most_steps[None], jnp.ones(1)
-    if varying:  # far from the data, a level grows until everything fits: go near it first, with sigma held
-        held = model.initial_sigma(model.box.from_unit(start)) if model.varying else sigmas[0]
-        sigmas = jnp.stack([held, jnp.full_like(held, jnp.nan)])
-        most, shared = jnp.stack([jnp.where(fresh, most_steps, 0), most_steps]), jnp.arange(2.0)
-    _, stages = jax.lax.scan(stage, start, (sigmas, shared, most))
-    last = jax.tree.map(lambda part: part[-1], stages)
-    finite = jnp.isfinite(last.cost)
-    return last._replace(
-        cost=jnp.where(finite, last.cost, jnp.inf),
-        steps=jnp.sum(stages.steps),
-        converged=last.converged & finite,
-        max_steps_reached=last.max_steps_reached & finite,
-        predicted=jnp.where(finite, last.predicted, jnp.nan),
-    )
-
-
 def descent(
     problem: FittingProblem, start: Floats, fresh: bool, most_steps: int, tolerance: float = COST_TOLERANCE
 ) -> Descent:
-    """`descend`, compiled once for all problems of this structure; numbers in double precision."""
-    found = problem.call(descend, start, np.asarray(fresh), np.asarray(most_steps), np.asarray(tolerance))
-    return Descent(*(np.asarray(part, float) if part.ndim else part.item() for part in found))
+    """Levenberg-Marquardt from `start` (P,) in the unit box, until a full step is predicted to gain less than
+    `tolerance` in the log-posterior. Not `fresh`: near a minimum, all levels free. Numbers in double precision."""
+    with one_thread():  # over all steps: to set it takes longer than to count it
+        vector, sigma = problem.call(_initial, start)
+        known, steps = problem.linearise(vector), 0
+        # far from the data, a level grows until everything fits: go near it first, with sigma held
+        rough = fresh and _varying(problem.model)
+        state = problem.call(_begin, start, known, np.asarray(fresh))
+        while True:
+            trial = state.trial
+            state, vector = problem.call(_advance, state, known, sigma, np.asarray(rough), np.asarray(tolerance))
+            if not (state.ended or state.steps >= most_steps):
+                known = problem.linearise(vector)
+                continue
+            steps += int(state.steps)
+            if not rough:
+                break
+            rough = False
+            if not np.array_equal(state.point, trial):
+                known = problem.linearise(problem.call(_initial, state.point)[0])
+            state = problem.call(_begin, state.point, known, np.asarray(fresh))
+        found = problem.call(_end, state)._replace(steps=np.asarray(steps))
+        return Descent(*(np.asarray(part, float) if part.ndim else part.item() for part in found))
+
+
+def _varying(model: Any) -> bool:
+    """Whether levels of noise are fitted."""
+    return model.objective == "likelihood" and bool(model.logarithmic)
+
+
+def _initial(model: Any, unit: Array) -> tuple[Array, Array]:
+    """The physical vector (P,) of a start, and the sigma that is held on the way from it; NaN: its own."""
+    vector = model.box.from_unit(unit)
+    held = model.objective == "likelihood" and model.varying
+    return vector, model.initial_sigma(vector) if held else jnp.full((1, 1), jnp.nan)
+
+
+def _begin(model: Any, unit: Array, known: list[Linearisation], fresh: Array) -> State:
+    """Before the first step from a point of which this is known."""
+    near = model.linearised(known, model.box.from_unit(unit))
+    auxiliary = jax.eval_shape(near.linear_parts, unit)[1]
+    auxiliary, watched = jax.tree.map(
+        lambda leaf: jnp.zeros(leaf.shape, leaf.dtype),
+        (auxiliary, jax.eval_shape(lambda rows: jnp.stack([rows] * unit.size), auxiliary[1])),
+    )
+    return first_state(unit, jnp.where(fresh, FIRST_DAMPING, NEARBY), auxiliary, watched)
+
+
+def _advance(
+    model: Any, state: State, known: list[Linearisation], sigma: Array, rough: Array, tolerance: Array
+) -> tuple[State, Array]:
+    """A step by what is known at its trial, and the physical vector of the next one."""
+    near, varying = model.linearised(known, model.box.from_unit(state.trial)), _varying(model)
+    first_step = (jnp.where(rough, sigma, jnp.nan), jnp.where(rough, 0.0, 1.0)) if varying else None
+    options = {
+        "watch": lambda auxiliary: auxiliary[1],
+        "tolerance": tolerance if model.objective == "likelihood" else None,
+        "logarithmic": model.logarithmic if varying else (),
+    }
+
+    def residuals(unit: Array, _: None) -> Any:
+        return near.linear_parts(model.box.from_unit(unit), first_step)
+
+    _, state, _ = BoxLevenbergMarquardt().step(residuals, state.point, None, options, state, frozenset())
+    return state, model.box.from_unit(state.trial)
+
+
+def _end(model: Any, state: State) -> Descent:
+    """What is known where a descent ended."""
+    finite = jnp.isfinite(state.cost)
+    return Descent(
+        vector=model.box.from_unit(state.point),
+        cost=jnp.where(finite, state.cost, jnp.inf),
+        steps=state.steps,
+        converged=state.ended & ~state.failed & finite,
+        max_steps_reached=~state.ended & finite,
+        gradient=state.gradient,
+        # R of the QR decomposition has A's singular values without squaring its condition number
+        root=jnp.linalg.qr(state.watched.T, mode="r"),
+        predicted=jnp.where(finite, state.auxiliary[0], jnp.nan),
+    )
 
 
 def evaluate_at(problem: FittingProblem, unit: Floats) -> Descent:

@@ -194,7 +194,7 @@ def polish(
     """The lowest of the ends, followed to its very minimum, and checked by L-BFGS-B where it has not converged.
 
     check: also where a parameter lies on a bound or has no influence. It takes a hundred steps: what begins at a
-    minimum that was checked goes without. tolerance: how far it is followed, see `descend`.
+    minimum that was checked goes without. tolerance: how far it is followed, see `descent`.
     """
     best, improved = int(np.argmin([end.cost for end in ends])), False
     lowest, likelihood = ends[best], problem.objective == "likelihood"

@@ -138,8 +138,8 @@ def error_between(
 
     def measured(one: lj.AddingDoubling) -> Floats:
         if one not in values:  # fits with and without discrepancy share a program
-            independent = replace(problem, transport=one, noise=replace(problem.noise, discrepancy=False))
-            values[one] = np.asarray(independent.predict(vector[: len(independent.names)]), float)
+            other = replace(problem.without_discrepancy, transport=one)
+            values[one] = np.asarray(other.predict(vector[: len(other.names)]), float)
         if problem.objective == "likelihood":
             return values[one]
         return np.asarray(problem.call(Model.standardised_at, vector, values[one]), float)

@@ -7,7 +7,7 @@ that of several.
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 from itertools import pairwise
 from typing import Any, Literal, NamedTuple, cast
 
@@ -62,6 +62,13 @@ class Parts(NamedTuple):
     relative: Array
     floor: Array
     correlation: Correlation | None
+
+
+class Linearisation(NamedTuple):
+    """What a model predicts at a vector, (N, C), in 1/sr, and its slopes by the first parameters, (M, N, C)."""
+
+    values: Any
+    slopes: Any
 
 
 class Model(eqx.Module):
@@ -134,6 +141,10 @@ class Model(eqx.Module):
         )
         projection = project(weights, size(values, softness) / total_sigma(values, variance, relative, floor))
         return replace(self, process=replace(self.process, projection=jax.tree.map(jnp.asarray, projection)))
+
+    def linearised(self, known: Sequence[Linearisation], at: Array) -> "Model":
+        """The model near a vector (P,) that its one data set was linearised at."""
+        return linear(self, known[0], at)
 
     @property
     def places(self) -> tuple[tuple[int, ...], ...]:
@@ -312,6 +323,28 @@ def _(primals: tuple[Array], tangents: tuple[Array], *, model: Model) -> tuple[A
     return value, columns @ moved[: model.moving]
 
 
+def linearise(model: Model, vector: Array) -> Linearisation:
+    """Values and slopes at a vector (P,), by the parameters that predictions depend on."""
+    steps = jnp.eye(vector.size, dtype=vector.dtype)[: model.moving]
+    return Linearisation(*jax.vmap(lambda step: jax.jvp(model.predict, (vector,), (step,)), out_axes=(None, 0))(steps))
+
+
+class Linear(Model):
+    """A model near a vector `at` (P,), by what is known there."""
+
+    near: Linearisation
+    at: Array
+
+    def predict(self, vector: Array) -> Array:
+        """Scaled BSDF, (N, C), in 1/sr."""
+        return self.near.values + jnp.tensordot((vector - self.at)[: len(self.near.slopes)], self.near.slopes, 1)
+
+
+def linear(model: Model, near: Linearisation, at: Array) -> Linear:
+    """The model near a vector (P,) that it was linearised at."""
+    return Linear(**{one.name: getattr(model, one.name) for one in fields(Model)}, near=near, at=at)
+
+
 class JointModel(eqx.Module):
     """Of several data sets, one after the other, (N, 1), the same functions as of one: the product of their densities.
 
@@ -327,6 +360,11 @@ class JointModel(eqx.Module):
     residuals, cost_at, log_prior = Model.residuals, Model.cost_at, Model.log_prior
     log_likelihood, log_likelihood_per_datum = Model.log_likelihood, Model.log_likelihood_per_datum
     log_posterior_unconstrained = Model.log_posterior_unconstrained
+
+    def linearised(self, known: Sequence[Linearisation], at: Array) -> "JointModel":
+        """The model near a vector (P,) that its data sets were linearised at."""
+        parts = zip(self._with_vectors(at), known, strict=True)
+        return replace(self, parts=tuple(linear(part, there, own) for (part, own), there in parts))
 
     @property
     def values(self) -> Array:

@@ -11,6 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from itertools import product
+from numbers import Real
 from typing import Any, NamedTuple, get_args
 
 import equinox as eqx
@@ -30,7 +31,7 @@ from fits.problem.compilation import Static, run
 from fits.problem.discrepancy import Discrepancy, Process, make_process, numbers_of
 from fits.problem.hemispherical import Totalling
 from fits.problem.instrument import Instrument, optics_of, setting_of
-from fits.problem.model import JointModel, Model, Transport
+from fits.problem.model import JointModel, Linearisation, Model, Transport, linearise
 from fits.problem.noise import Levels, Noise, is_assumed, noise_levels, require_size
 from fits.problem.parameters import Box, Free, LogNormal, Normal, is_free, names_of, require_in_range, split
 from layerjax._checks import in_short, require_choice, require_kind, require_number
@@ -166,11 +167,19 @@ class FittingProblem(abc.ABC):
         if function in vars(Model).values():
             function = getattr(type(self.model), function.__name__)
 
-        def is_vector(argument: Any) -> bool:  # numbers that are listed make an array; a named tuple holds arrays
-            return type(argument) in (list, tuple)
+        def is_vector(argument: Any) -> bool:  # numbers that are listed make an array; other tuples hold arrays
+            return type(argument) in (list, tuple) and all(isinstance(one, Real | np.generic) for one in argument)
 
         arrays = (jax.tree.map(jnp.asarray, argument, is_leaf=is_vector) for argument in arguments)
         return run(function, self.split_model, *arrays)
+
+    def linearise(self, vector: ArrayLike) -> list[Linearisation]:
+        """Predictions of each data set at a vector (P,), and their slopes: by one program, with discrepancy or not."""
+        vector, known = np.asarray(vector, float), []
+        for name, problem in self.problems.items():
+            forward = problem.without_discrepancy
+            known.append(forward.call(linearise, vector[list(self.places(name))[: len(forward.names)]]))
+        return known
 
     @cached_property
     def split_model(self) -> tuple[Any, Static]:
@@ -235,6 +244,15 @@ class Problem(FittingProblem):
         """The one measurement."""
         return {"": self}
 
+    @cached_property
+    def without_discrepancy(self) -> "Problem":
+        """The problem with independent noise, whose parameters are the first of this one; it predicts the same."""
+        if not self.noise.discrepancy:
+            return self
+        other, own = replace(self, noise=replace(self.noise, discrepancy=False)), self.model
+        same = {name: getattr(own, name) for name in ("wi", "wo", "known", "optics", "side", "transport")}
+        return other.with_model(replace(other.model, **same))
+
     def with_problems(self, changed: "Mapping[str, Problem]") -> "Problem":
         """What stands in its place."""
         return changed.get("", self)
@@ -254,6 +272,8 @@ class Problem(FittingProblem):
         """The problem with other arrays in its model."""
         other = copy.copy(self)  # which takes what `__getstate__` gives
         vars(other)["_assembled"] = self._assembled._replace(model=model)
+        if "without_discrepancy" in vars(self) and self.noise.discrepancy and model.wi is self.model.wi:
+            vars(other)["without_discrepancy"] = self.without_discrepancy
         return other
 
 
