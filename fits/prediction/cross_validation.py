@@ -157,7 +157,8 @@ def without(problem: Problem, held_out: ArrayLike) -> Problem:
     model, rows = problem.model, jnp.asarray(held_out)[:, None]
     infinite = INFINITE_NOISE * jnp.max(jnp.abs(model.values) + model.lowest)
     if model.process is not None:
-        infinite = INFINITE_ERROR * size(model.values, model.softness)
+        floor = model.build(model.box.high).floor  # where it is fitted, it must not matter either
+        infinite = INFINITE_ERROR * jnp.hypot(size(model.values, model.softness), floor)
     model = replace(
         model,
         variance=jnp.where(rows, infinite**2, model.variance),

@@ -211,14 +211,15 @@ def project(weights: Any, relative: Any) -> Projection:
     """The projection of measurements with these weights (N, R) and errors, see `Process`; of numpy or JAX."""
     xp = weights.__array_namespace__()
 
-    def covariance(column: Any) -> Any:
+    def root(column: Any) -> Any:
         rows = column[:, None] * weights
         scale = 1.0 / xp.linalg.norm(rows, axis=0)
-        inverse = xp.linalg.inv(_with_jitter((rows * scale).T @ (rows * scale), 0.0))
-        return scale[:, None] * (0.5 * (inverse + inverse.T)) * scale
+        gram = _with_jitter((rows * scale).T @ (rows * scale), 0.0)
+        upper = xp.linalg.cholesky(gram[::-1, ::-1])[::-1, ::-1]  # G = U U', so that G^-1 = U^-1' U^-1
+        return scale[:, None] * xp.linalg.inv(upper).T
 
-    found = xp.stack([covariance(column) for column in relative.T])
-    return Projection(found, xp.linalg.cholesky(found))
+    roots = xp.stack([root(column) for column in relative.T])
+    return Projection(roots @ xp.swapaxes(roots, 1, 2), roots)
 
 
 class Whitened(NamedTuple):
@@ -326,6 +327,12 @@ class Process(eqx.Module):
         both = jnp.einsum("cx,crn->crxn", jnp.eye(len(rows)), rows).reshape(len(found.root), -1)
         inside = jnp.sum(solve_triangular(found.root, both, lower=True) ** 2, axis=0).reshape(relative.shape[::-1])
         precision = 1.0 - relative * jnp.einsum("crn,nr->nc", rows, self.weights) + inside.T
+        # no less than that of a measurement by itself, which rounding may lose beside much smaller noise
+        between, own = self._covariances(self._numbers(at, relative.shape[-1]), relative.shape[-1])
+        variances = (
+            at.amplitude**2 * jnp.sum(self.weights @ own * self.weights, axis=1)[:, None] * jnp.diagonal(between)
+        )
+        precision = jnp.maximum(precision, 1.0 / (1.0 + relative**2 * variances))
         return relative * misfit - self.errors(explained, relative), precision
 
     def predict(self, at_places: Array, misfit: Array, relative: Array, at: Correlation) -> tuple[Array, Array]:
@@ -352,7 +359,10 @@ class Process(eqx.Module):
 
     def _covariance(self, numbers: Array, channels: int) -> Array:
         """Covariance of errors at inducing points, (C R, C R)."""
-        return jnp.kron(*self._covariances(numbers, channels)) * numbers[0] ** 2
+        between, own = self._covariances(numbers, channels)
+        rounding = _rounding(own, len(between) * len(own))  # smallest eigenvalues are products of those of the two
+        both, variances = jnp.kron(between, own), jnp.kron(jnp.diagonal(between), jnp.diagonal(own))
+        return (both + rounding * jnp.diag(variances)) * numbers[0] ** 2
 
     def _estimate_rows(self, relative: Array, projection: Projection) -> Array:
         """G^-1 W', (C, R, N): the estimate by each measurement."""
@@ -437,8 +447,13 @@ def _triangular_inverse(root: Array) -> Array:
 
 def _with_jitter(matrix: Any, least: float = JITTER) -> Any:
     """A matrix of correlations with what rounding leaves of its smallest eigenvalues on its diagonal."""
-    rounding = 4.0 * len(matrix) * float(jnp.finfo(matrix.dtype).eps)  # above `JITTER` in single precision alone
+    rounding = _rounding(matrix, len(matrix))  # above `JITTER` in single precision alone
     return matrix + max(least, rounding) * np.eye(len(matrix), dtype=matrix.dtype)
+
+
+def _rounding(matrix: Any, rows: int) -> float:
+    """Of the largest eigenvalue of so many rows."""
+    return 4.0 * rows * float(jnp.finfo(matrix.dtype).eps)
 
 
 def make_process(wi: ArrayLike, wo: ArrayLike, channels: int = 1) -> Process:

@@ -62,6 +62,16 @@ def test_held_out_rows_have_no_influence(discrepancy: bool) -> None:
         assert gaps[0] == pytest.approx(gaps[1], abs=1e-3 if discrepancy else 1e-6)
 
 
+def test_held_out_rows_tell_nothing_of_a_floor() -> None:
+    """Next to dark measurements noise of a thousand times their size was less than the floor's upper bound."""
+    noise = Noise(relative=0.01, floor=Free(1e-5, 1e-6, 0.1), discrepancy=True)
+    dark = replace(DATA, values=0.0 * DATA.values)
+    problem, rows = Problem(STACK, dark, line, noise), np.arange(len(DATA)) % 3 == 0
+    model = without(problem, rows).model
+    sigmas = [np.asarray(model.sigma_at(vector, dark.values))[rows] for vector in (problem.start, problem.high)]
+    np.testing.assert_allclose(*sigmas, rtol=1e-5)
+
+
 def test_held_out_data_are_predicted_by_the_others(found: Fit) -> None:
     left = cross_validate(found, draws=2000)
     assert left.groups == ("θᵢ = 10°", "θᵢ = 30°", "θᵢ = 50°")

@@ -241,3 +241,17 @@ def test_a_smooth_process_has_a_root_in_single_precision() -> None:
         )
     )
     np.testing.assert_allclose(rough, found, atol=1e-2 * float(jnp.max(jnp.abs(found))))
+
+
+@pytest.mark.parametrize("double", [False, True])
+def test_channels_that_share_all_errors_have_finite_densities(double: bool) -> None:
+    """At a correlation of 1, with noise far below the discrepancy, the covariance was no longer positive definite."""
+    misfit, relative = np.full((len(MANY.wi), 3), 0.1), np.full((len(MANY.wi), 3), 1e6)
+    with jax.enable_x64(double):
+        process = make_process(MANY.wi, MANY.wo, 3)
+        for length in (15.0, 40.0, 360.0):
+            at = Correlation(1.0, length, length, 2.0, 1.0)
+            whitened = process.whitened(jnp.asarray(misfit), jnp.asarray(relative), at)
+            precision = process.leave_one_out(jnp.asarray(misfit), jnp.asarray(relative), at)[1]
+            assert all(bool(jnp.all(jnp.isfinite(part))) for part in whitened)
+            assert bool(jnp.all(precision > 0.0))
