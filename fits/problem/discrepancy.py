@@ -452,7 +452,7 @@ def _with_jitter(matrix: Any, least: float = JITTER) -> Any:
 
 
 def _rounding(matrix: Any, rows: int) -> float:
-    """Of the largest eigenvalue of so many rows."""
+    """What rounding leaves of the eigenvalues of so many rows, as a share of the largest."""
     return 4.0 * rows * float(jnp.finfo(matrix.dtype).eps)
 
 
