@@ -170,7 +170,10 @@ class FittingProblem(abc.ABC):
         def is_vector(argument: Any) -> bool:  # numbers that are listed make an array; other tuples hold arrays
             return type(argument) in (list, tuple) and all(isinstance(one, Real | np.generic) for one in argument)
 
-        arrays = (jax.tree.map(jnp.asarray, argument, is_leaf=is_vector) for argument in arguments)
+        def array(leaf: Any) -> Array:
+            return leaf if isinstance(leaf, Array) else jnp.asarray(leaf)  # which is slow where nothing is to be done
+
+        arrays = (jax.tree.map(array, argument, is_leaf=is_vector) for argument in arguments)
         return run(function, self.split_model, *arrays)
 
     def linearise(self, vector: ArrayLike) -> list[Linearisation]:
