@@ -318,11 +318,9 @@ def _initial(model: Any, unit: Array) -> tuple[Array, Array]:
 def _begin(model: Any, unit: Array, known: list[Linearisation], fresh: Array) -> State:
     """Before the first step from a point of which this is known."""
     near = model.linearised(known, model.box.from_unit(unit))
-    auxiliary = jax.eval_shape(near.linear_parts, unit)[1]
-    auxiliary, watched = jax.tree.map(
-        lambda leaf: jnp.zeros(leaf.shape, leaf.dtype),
-        (auxiliary, jax.eval_shape(lambda rows: jnp.stack([rows] * unit.size), auxiliary[1])),
-    )
+    predicted, rows = jax.eval_shape(near.linear_parts, unit)[1]
+    auxiliary = jnp.zeros(predicted.shape, predicted.dtype), jnp.zeros(rows.shape, rows.dtype)
+    watched = jnp.zeros((unit.size, *rows.shape), rows.dtype)
     return first_state(unit, jnp.where(fresh, FIRST_DAMPING, NEARBY), auxiliary, watched)
 
 
