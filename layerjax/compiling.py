@@ -82,7 +82,12 @@ def filter_jit(function: Callable[P, T]) -> Callable[P, T]:
 
 def is_outermost(*inputs: Any) -> bool:
     """Whether a program of these inputs would be the outermost: not within one that is traced, even if all is known."""
-    return not is_traced(*inputs, jax.lax.full((), 0.0))
+    return not is_traced(*inputs, _zero())
+
+
+@jax.jit
+def _zero() -> jax.Array:  # of all ways to see whether one is within a program the fastest: some microseconds
+    return jax.lax.full((), 0.0)
 
 
 def is_traced(*inputs: Any) -> bool:

@@ -12,6 +12,7 @@ To compile the Jacobian of a costly transport takes longer than most fits take t
 which fits with and without discrepancy share, and the others see the model as linear at a trial (`Problem.linearise`).
 """
 
+import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -258,18 +259,18 @@ def _damped_solve(matrix: Array, slope: Array, known: Array, fixed: Array, dampi
 
 
 class Descent(NamedTuple):
-    """Where a descent ended, and what is known there of a model with P parameters: arrays of JAX, or numbers and numpy.
+    """Where a descent ended, and what is known there of a model with P parameters.
 
     vector: physical, (P,). cost: infinite where the model has no finite value and Jacobian. steps: in all.
     gradient: of the cost in the unit box, (P,). root: (P, P), its root' root is the information in the data, in
     boxes^-2. predicted: (N, C), in 1/sr, NaN with an infinite cost. These are None of an end that was stored.
     """
 
-    vector: Any
-    cost: Any
-    steps: Any
-    converged: Any
-    max_steps_reached: Any
+    vector: Floats
+    cost: float
+    steps: int
+    converged: bool
+    max_steps_reached: bool
     gradient: Any = None
     root: Any = None
     predicted: Any = None
@@ -281,26 +282,25 @@ def descent(
     """Levenberg-Marquardt from `start` (P,) in the unit box, until a full step is predicted to gain less than
     `tolerance` in the log-posterior. Not `fresh`: near a minimum, all levels free. Numbers in double precision."""
     with one_thread():  # over all steps: to set it takes longer than to count it
-        vector, sigma = problem.call(_initial, start)
+        state, vector, sigma = problem.call(_initial, start, np.asarray(fresh))
         known, steps = problem.linearise(vector), 0
         # far from the data, a level grows until everything fits: go near it first, with sigma held
         rough = fresh and _varying(problem.model)
-        state = problem.call(_begin, start, known, np.asarray(fresh))
         while True:
             trial = state.trial
-            state, vector = problem.call(_advance, state, known, sigma, np.asarray(rough), np.asarray(tolerance))
-            if not (state.ended or state.steps >= most_steps):
-                known = problem.linearise(vector)
+            state, vector, next_vector = problem.call(
+                _advance, state, known, sigma, np.asarray(rough), np.asarray(tolerance)
+            )
+            if not (state.ended or int(state.steps) >= most_steps):
+                known = problem.linearise(next_vector)
                 continue
             steps += int(state.steps)
             if not rough:
-                break
+                return _end(state, vector, steps)
             rough = False
             if not np.array_equal(state.point, trial):
-                known = problem.linearise(problem.call(_initial, state.point)[0])
-            state = problem.call(_begin, state.point, known, np.asarray(fresh))
-        found = problem.call(_end, state)._replace(steps=np.asarray(steps))
-        return Descent(*(np.asarray(part, float) if part.ndim else part.item() for part in found))
+                known = problem.linearise(vector)
+            state, *_ = problem.call(_initial, state.point, np.asarray(fresh))
 
 
 def _varying(model: Any) -> bool:
@@ -308,26 +308,22 @@ def _varying(model: Any) -> bool:
     return model.objective == "likelihood" and bool(model.logarithmic)
 
 
-def _initial(model: Any, unit: Array) -> tuple[Array, Array]:
-    """The physical vector (P,) of a start, and the sigma that is held on the way from it; NaN: its own."""
+def _initial(model: Any, unit: Array, fresh: Array) -> tuple[State, Array, Array]:
+    """Before the first step from a point, the physical vector (P,) there, and the sigma that is held on the way from
+    it; NaN: its own."""
     vector = model.box.from_unit(unit)
     held = model.objective == "likelihood" and model.varying
-    return vector, model.initial_sigma(vector) if held else jnp.full((1, 1), jnp.nan)
-
-
-def _begin(model: Any, unit: Array, known: list[Linearisation], fresh: Array) -> State:
-    """Before the first step from a point of which this is known."""
-    near = model.linearised(known, model.box.from_unit(unit))
-    predicted, rows = jax.eval_shape(near.linear_parts, unit)[1]
+    predicted, rows = jax.eval_shape(model.linearised(model.nothing_known, vector).linear_parts, vector)[1]
     auxiliary = jnp.zeros(predicted.shape, predicted.dtype), jnp.zeros(rows.shape, rows.dtype)
     watched = jnp.zeros((unit.size, *rows.shape), rows.dtype)
-    return first_state(unit, jnp.where(fresh, FIRST_DAMPING, NEARBY), auxiliary, watched)
+    state = first_state(unit, jnp.where(fresh, FIRST_DAMPING, NEARBY), auxiliary, watched)
+    return state, vector, model.initial_sigma(vector) if held else jnp.full((1, 1), jnp.nan)
 
 
 def _advance(
     model: Any, state: State, known: list[Linearisation], sigma: Array, rough: Array, tolerance: Array
-) -> tuple[State, Array]:
-    """A step by what is known at its trial, and the physical vector of the next one."""
+) -> tuple[State, Array, Array]:
+    """A step by what is known at its trial; and the physical vectors, (P,), of the best point and the next trial."""
     near, varying = model.linearised(known, model.box.from_unit(state.trial)), _varying(model)
     first_step = (jnp.where(rough, sigma, jnp.nan), jnp.where(rough, 0.0, 1.0)) if varying else None
     options = {
@@ -340,22 +336,23 @@ def _advance(
         return near.linear_parts(model.box.from_unit(unit), first_step)
 
     _, state, _ = BoxLevenbergMarquardt().step(residuals, state.point, None, options, state, frozenset())
-    return state, model.box.from_unit(state.trial)
+    return state, model.box.from_unit(state.point), model.box.from_unit(state.trial)
 
 
-def _end(model: Any, state: State) -> Descent:
-    """What is known where a descent ended."""
-    finite = jnp.isfinite(state.cost)
+def _end(state: State, vector: Array, steps: int) -> Descent:
+    """What is known where a descent ended, at a physical vector (P,)."""
+    finite = bool(np.isfinite(state.cost))
+    predicted, _ = state.auxiliary
     return Descent(
-        vector=model.box.from_unit(state.point),
-        cost=jnp.where(finite, state.cost, jnp.inf),
-        steps=state.steps,
-        converged=state.ended & ~state.failed & finite,
-        max_steps_reached=~state.ended & finite,
-        gradient=state.gradient,
+        vector=np.asarray(vector, float),
+        cost=float(state.cost) if finite else math.inf,
+        steps=steps,
+        converged=bool(state.ended) and not state.failed and finite,
+        max_steps_reached=not state.ended and finite,
+        gradient=np.asarray(state.gradient, float),
         # R of the QR decomposition has A's singular values without squaring its condition number
-        root=jnp.linalg.qr(state.watched.T, mode="r"),
-        predicted=jnp.where(finite, state.auxiliary[0], jnp.nan),
+        root=np.linalg.qr(np.asarray(state.watched, float).T, mode="r"),
+        predicted=np.asarray(predicted, float) if finite else np.full(predicted.shape, math.nan),
     )
 
 

@@ -147,6 +147,11 @@ class Model(eqx.Module):
         return linear(self, known[0], at)
 
     @property
+    def nothing_known(self) -> list[Linearisation]:
+        """In the shape of what `linearised` asks for, of the one data set."""
+        return [Linearisation(jnp.zeros_like(self.values), jnp.zeros((self.moving, *self.values.shape)))]
+
+    @property
     def places(self) -> tuple[tuple[int, ...], ...]:
         """Of the parameters of the one data set: all of them."""
         return (tuple(range(len(self.box.low))),)
@@ -365,6 +370,11 @@ class JointModel(eqx.Module):
         """The model near a vector (P,) that its data sets were linearised at."""
         parts = zip(self._with_vectors(at), known, strict=True)
         return replace(self, parts=tuple(linear(part, there, own) for (part, own), there in parts))
+
+    @property
+    def nothing_known(self) -> list[Linearisation]:
+        """In the shape of what `linearised` asks for."""
+        return [known for part in self.parts for known in part.nothing_known]
 
     @property
     def values(self) -> Array:

@@ -170,8 +170,8 @@ class FittingProblem(abc.ABC):
         def is_vector(argument: Any) -> bool:  # numbers that are listed make an array; other tuples hold arrays
             return type(argument) in (list, tuple) and all(isinstance(one, Real | np.generic) for one in argument)
 
-        def array(leaf: Any) -> Array:
-            return leaf if isinstance(leaf, Array) else jnp.asarray(leaf)  # which is slow where nothing is to be done
+        def array(leaf: Any) -> Any:  # of numpy for compiled programs, which take it faster than jnp.asarray makes one
+            return leaf if isinstance(leaf, Array | np.ndarray) else np.asarray(leaf)
 
         arrays = (jax.tree.map(array, argument, is_leaf=is_vector) for argument in arguments)
         return run(function, self.split_model, *arrays)
