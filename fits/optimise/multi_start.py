@@ -139,7 +139,7 @@ def lbfgsb_polish(problem: FittingProblem, end: Descent) -> tuple[Descent, bool]
     An end that neither of them improves has converged if one of them says so.
     """
 
-    def value_and_gradient(unit: Floats) -> tuple[Floats, Floats]:  # the gradient in reverse would be compiled for this
+    def value_and_gradient(unit: Floats) -> tuple[float, Floats]:  # the gradient in reverse would be compiled for this
         found = evaluate_at(problem, unit)
         return found.cost, found.gradient
 
