@@ -64,11 +64,14 @@ def require_free_place(path: str | Path | None, force: bool, ending: str = "", w
 
 
 def show(*what: "Table | str") -> None:
-    """Prints tables and sentences."""
+    """Prints sentences, and tables that have a row."""
     from fits.reports.tables import print_table
 
     for one in what:
-        print(one) if isinstance(one, str) else print_table(one, sys.stdout)
+        if isinstance(one, str):
+            print(one)
+        elif one.rows:
+            print_table(one, sys.stdout)
 
 
 @contextmanager

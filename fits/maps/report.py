@@ -104,8 +104,7 @@ def verdict(summary: Summary, map: FittedMap) -> tuple[list[str], bool]:
     assumed = about.get("noise_assumed", False)
     words += [NOISE_ASSUMED] if assumed else []
     low, median, high = summary.quartiles["reduced_chi_square"]
-    own = [name for name in map.names if name not in about["common"]]
-    freedom = summary.quartiles["measurements"][1] - len(own)
+    freedom = summary.quartiles["measurements"][1] - len(map.names)
     spread = math.sqrt(2.0 / freedom) if freedom > 0 else math.inf
     far = option("chi_square_sigmas") * spread
     if math.isfinite(median):
@@ -147,23 +146,16 @@ def verdict(summary: Summary, map: FittedMap) -> tuple[list[str], bool]:
     if map.numerical_error is not None:
         but = "" if accurate else ": a finer resolution may give other values"
         words.append(f"The numerical error of the model is at most {error:.2g} standard deviations in the pilot{but}.")
-    words += smoothing_words(map)
+    if (smoothing := map.smoothing) is not None:
+        scales = ", ".join(f"{name} {one:g}" for name, one in smoothing["prior"]["scale"].items())
+        settled = "" if smoothing["settled"] else ": it has not settled"
+        words.append(
+            f"Smoothed beside the plain fit by block alternation ({smoothing['prior']['kind'].replace('_', ' ')}, of "
+            f"the bounds: {scales}), in {smoothing['rounds']} rounds; in the last one texels moved by at most "
+            f"{smoothing['largest_moves'][-1]:.2g} standard errors{settled}."
+        )
+        words.append("Errors of the smoothed map are conditional on the values of the neighbours.")
     return words, finished and converged and explained and few_flagged and joint and not unknown and accurate
-
-
-def smoothing_words(map: FittedMap) -> list[str]:
-    """How a map was smoothed, and whether that has settled, in a few sentences; none if it was not."""
-    about = map.smoothing
-    if about is None:
-        return []
-    scales, settled = about["prior"]["scale"], "" if about["settled"] else ": it has not settled"
-    each = ", ".join(f"{name} {one:g}" for name, one in scales.items())
-    return [
-        f"Smoothed beside the plain fit by block alternation ({about['prior']['kind'].replace('_', ' ')}, of the "
-        f"bounds: {each}), in {about['rounds']} rounds; in the last one texels moved by at most "
-        f"{about['largest_moves'][-1]:.2g} standard errors{settled}.",
-        "Errors of the smoothed map are conditional on the values of the neighbours.",
-    ]
 
 
 def share(part: float, whole: float) -> str:
@@ -175,32 +167,20 @@ def share(part: float, whole: float) -> str:
 # ---- in tables ----
 
 
-def count_table(summary: Summary) -> Table:
-    """How many texels have each flag, and which share of the map."""
-    rows = [("of the map", summary.texels, "")]
-    if summary.done < summary.texels:
-        rows.append(("done so far", summary.done, share(summary.done, summary.texels)))
-    for flag, count in summary.counts.items():
-        if count or flag == "fitted":
-            of_map = flag in ("fitted", "masked", "too_few_measurements", "failed")
-            percent = share(count, summary.texels) if of_map else f"{share(count, summary.fitted)} of the fitted"
-            rows.append((flag.replace("_", " "), count, percent))
-    for name, count in summary.at_bound.items():
-        if count:
-            rows.append((f"at a bound: {name}", count, f"{share(count, summary.fitted)} of the fitted"))
-    return Table("Texels", ("", "texels", "share"), tuple((words, f"{count:,}", part) for words, count, part in rows))
-
-
 def quartile_table(summary: Summary, map: FittedMap) -> Table:
-    """Quartiles over the fitted texels: of each parameter, of its standard error, and of how well texels are fitted."""
+    """Quartiles over the fitted texels: of each parameter, of its standard error, and of how well texels are fitted;
+    and how many texels have a parameter at a bound."""
 
     def words(path: str) -> tuple[str, ...]:
         return tuple(f"{value:.4g}" if math.isfinite(value) else "" for value in summary.quartiles[path])
 
-    rows = [(name, *words(f"values/{name}"), *words(f"errors/{name}"), map.units[name]) for name in map.names]
-    rows.append(("chi2/dof", *words("reduced_chi_square"), "", "", "", "1"))
-    rows.append(("measurements", *words("measurements"), "", "", "", "1"))
-    columns = ("", "25 %", "median", "75 %", "error: 25 %", "error: median", "error: 75 %", "unit")
+    rows = [
+        (name, *words(f"values/{name}"), *words(f"errors/{name}"), map.units[name], share(count, summary.fitted or 1))
+        for name, count in summary.at_bound.items()
+    ]
+    rows.append(("chi2/dof", *words("reduced_chi_square"), "", "", "", "1", ""))
+    rows.append(("measurements", *words("measurements"), "", "", "", "1", ""))
+    columns = ("", "25 %", "median", "75 %", "error: 25 %", "error: median", "error: 75 %", "unit", "at a bound")
     return Table("Quartiles over the fitted texels", columns, tuple(rows), "Of errors, those that are finite.")
 
 
@@ -248,7 +228,7 @@ def report(map: FittedMap, path: str | Path, force: bool = True, progress: Progr
     numbers, title = summarise(map), f"Map of {map.path.resolve().name}"
     body = [f"<h1>{html.escape(title)}</h1>", verdict_box(*verdict(numbers, map))]
     flags = _figures(map, ("The gravest flag of each texel.", flag_picture(map.flags)))
-    body.append(section("Texels", flags, count_table(numbers)))
+    body.append(section("Texels", flags))
     if numbers.fitted:
         body.append(section("Values in short", quartile_table(numbers, map), common_table(map)))
         parts = ['<p class="note">Colours run over the middle 98 % of the values.</p>']
