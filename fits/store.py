@@ -38,10 +38,8 @@ import numpy as np
 from fits._files import locked, named, require_there
 
 APPLICATION = 0x6C6A7802  # SQLite's application_id of a store; its last digits are the version of the layout
-_LAYOUT = """
-CREATE TABLE records (number INTEGER PRIMARY KEY, key TEXT, checksum INTEGER, text TEXT);
-"""
-_ARRAY, _WHOSE = "numpy", "fingerprint"
+_LAYOUT = "CREATE TABLE records (number INTEGER PRIMARY KEY, key TEXT, checksum INTEGER, text TEXT)"
+_ARRAY, _WHOSE, _DIGEST = "numpy", "fingerprint", "sha256:"
 _NO_ROOM = (sqlite3.SQLITE_FULL, sqlite3.SQLITE_IOERR_WRITE, sqlite3.SQLITE_IOERR_FSYNC, sqlite3.SQLITE_IOERR_TRUNCATE)
 _OF_SYSTEM = {
     sqlite3.SQLITE_READONLY: errno.EACCES,
@@ -113,11 +111,6 @@ class Store:
         with _errors_of(path):
             _require_store(path)
             return cls(path, _copied(path))
-
-    def keys(self) -> list[str]:
-        """Keys of all records, in the order in which they were written."""
-        rows = self._select("SELECT key FROM records ORDER BY number") if self.fingerprint else []
-        return list(dict.fromkeys(key for (key,) in rows if key != _WHOSE))
 
     def get(self, key: str) -> Any:
         """The record of a key, the last one of several; None without any."""
@@ -218,9 +211,6 @@ def damaged(path: str | Path) -> str:
 def portable_repr(thing: Any) -> str:
     """As it shows itself, but not where in memory it is, which no other process knows."""
     return re.sub(r" at 0x[0-9a-fA-F]+", "", repr(thing))
-
-
-_DIGEST = "sha256:"
 
 
 def _digest(part: Any) -> str:
