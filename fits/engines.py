@@ -155,11 +155,16 @@ def _run_threads(work: Work, shared: Any, tasks: list[Any], threads: int | None)
     # the first by itself: it compiles the program, which keeps one core busy
     for index, task in islice(pending, None if most == 1 else 1):
         yield index, attempt(work, shared, task)
+    running: dict[futures.Future[Any], int] = {}
     pool = futures.ThreadPoolExecutor(most)
-    try:
-        running = {pool.submit(broadcasting(attempt), work, shared, task): index for index, task in pending}
-        for future in futures.as_completed(list(running)):
-            yield running.pop(future), future.result()
+    try:  # each is begun when there is room for it: an interrupt need not wait for the others
+        while True:
+            for index, task in islice(pending, most - len(running)):
+                running[pool.submit(broadcasting(attempt), work, shared, task)] = index
+            if not running:
+                return
+            for future in futures.wait(running, return_when=futures.FIRST_COMPLETED).done:
+                yield running.pop(future), future.result()
     finally:
         pool.shutdown(cancel_futures=True)  # waits for the tasks that have begun
 

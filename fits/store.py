@@ -41,12 +41,7 @@ APPLICATION = 0x6C6A7802  # SQLite's application_id of a store; its last digits 
 _LAYOUT = "CREATE TABLE records (number INTEGER PRIMARY KEY, key TEXT, checksum INTEGER, text TEXT)"
 _ARRAY, _WHOSE, _DIGEST = "numpy", "fingerprint", "sha256:"
 _NO_ROOM = (sqlite3.SQLITE_FULL, sqlite3.SQLITE_IOERR_WRITE, sqlite3.SQLITE_IOERR_FSYNC, sqlite3.SQLITE_IOERR_TRUNCATE)
-_OF_SYSTEM = {
-    sqlite3.SQLITE_READONLY: errno.EACCES,
-    sqlite3.SQLITE_CANTOPEN: errno.EACCES,
-    sqlite3.SQLITE_PERM: errno.EACCES,
-    sqlite3.SQLITE_IOERR: errno.EIO,
-}
+_OF_SYSTEM = (sqlite3.SQLITE_READONLY, sqlite3.SQLITE_CANTOPEN, sqlite3.SQLITE_PERM, sqlite3.SQLITE_IOERR)
 _LONGEST = 60  # letters of a value that a fingerprint shows
 
 
@@ -86,7 +81,6 @@ class Store:
                 if fresh:
                     for one in (path, _journal(path)):
                         one.unlink(missing_ok=True)
-                _require_store(path)
                 # the lock file is what keeps others out: SQLite's own locks do not hold on every file system
                 place = f"{path.resolve().as_uri()}?nolock=1"
                 connection = sqlite3.connect(place, uri=True, check_same_thread=False)
@@ -109,8 +103,12 @@ class Store:
         path = Path(path)
         require_there(path)
         with _errors_of(path):
-            _require_store(path)
             return cls(path, _copied(path))
+
+    def keys(self) -> list[str]:
+        """Keys of all records, in the order in which they were written."""
+        rows = self._select("SELECT key FROM records ORDER BY number") if self.fingerprint else []
+        return list(dict.fromkeys(key for (key,) in rows if key != _WHOSE))
 
     def get(self, key: str) -> Any:
         """The record of a key, the last one of several; None without any."""
@@ -256,15 +254,6 @@ def _checksum(key: str, text: str) -> int:
     return zlib.crc32(f"{len(key)} {key} {text}".encode())
 
 
-def _require_store(path: Path) -> None:
-    """ValueError for a file that is something else."""
-    if path.is_file():
-        with open(path, "rb") as file:
-            begin = file.read(16)
-        if begin not in (b"", b"SQLite format 3\0"):
-            raise ValueError(damaged(path))
-
-
 def _copied(path: Path) -> sqlite3.Connection:
     """The last whole state of a database in memory, from its file and the journal of a writer at work or killed."""
     while True:
@@ -307,7 +296,7 @@ def _errors_of(path: Path) -> Iterator[None]:
         if code == sqlite3.SQLITE_READONLY_DBMOVED:
             raise OSError(errno.ENOENT, "Removed, or replaced, while it was written", str(path)) from None
         if code & 0xFF in _OF_SYSTEM:
-            raise OSError(_OF_SYSTEM[code & 0xFF], str(error).capitalize(), str(path)) from None
+            raise OSError(errno.EIO, str(error).capitalize(), str(path)) from None
         raise ValueError(damaged(path)) from None
     except (UnicodeError, TypeError, LookupError):  # what stands there is of another kind
         raise ValueError(damaged(path)) from None

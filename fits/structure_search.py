@@ -24,8 +24,10 @@ from fits.data.measurements import TO_HAVE_THEM, Measurements
 from fits.optimise.fit import fit as run_fit
 from fits.optimise.options import DEFAULT, FitOptions
 from fits.optimise.result import Fit
+from fits.prediction.compare import ComparedFit, Comparison
 from fits.prediction.cross_validation import CrossValidation, ModelScore, out_of_sample, rank_models
 from fits.prediction.importance import Evidence
+from fits.prediction.options import ComparisonOptions
 from fits.problem.compilation import cores, make_room
 from fits.problem.instrument import Instrument
 from fits.problem.model import Transport
@@ -36,6 +38,7 @@ from fits.problem.stack_file import check_keys, read_tables, require_table, stac
 from fits.progress import Progress, given_progress
 from fits.reports.pages import Table
 from fits.reports.results import load_fit, save_fit
+from fits.reports.tables import comparison_table
 from fits.reports.verdicts import listed, verdict
 from fits.store import Store, fingerprint, make_directory
 from layerjax._checks import require_count, require_kind, require_number, require_seed
@@ -287,7 +290,7 @@ def search(
             leader, lowest = list(scores)[:1], min(bic.values(), default=math.inf)
             # every structure of the level with independent noise, at a coarse resolution
             fits |= work.in_parallel(f"{len(level[0]) - 1} layers", partial(work.fit, coarse=True), level)
-            bic |= {one: _bic(fits[one]) for one in level}
+            bic |= {one: ComparedFit(named(one), fits[one]).bic for one in level}
             # those of the lowest BIC as `fits.fit` fits them, cross-validated
             best_of_level = sorted(level, key=bic.__getitem__)[: options.cross_validated]
             checked |= work.in_parallel("cross-validation", work.cross_validate, best_of_level)
@@ -373,11 +376,6 @@ def _neighbours(library: Library, structures: Iterable[Structure], most: int) ->
     return list(dict.fromkeys(one for one in neighbours if all(a != b for a, b in pairwise(one))))
 
 
-def _bic(fit: Fit) -> float:
-    """Bayesian information criterion."""
-    return len(fit.vector) * math.log(fit.problem.count) - 2.0 * fit.log_likelihood
-
-
 def _scores(checked: Mapping[Structure, Checked]) -> dict[Structure, ModelScore]:
     """Scores of structures side by side, best first."""
     ranked = sorted(checked, key=lambda one: -checked[one].held_out.elpd)
@@ -389,25 +387,12 @@ def _scores(checked: Mapping[Structure, Checked]) -> dict[Structure, ModelScore]
 # ---- what it found ----
 
 
-def search_table(search: Search, most: int | None = None) -> Table:
-    """A row for each structure, best first."""
-    rows = []
-    for one in search.candidates[:most]:
-        score, without = one.model_score, one.fit.without_discrepancy
-        count, ratio, cells = one.parameters, one.fit.reduced_chi_square, ("", "", "", "")
-        if without is not None:  # of the stack alone
-            count, ratio = len(without.values), without.chi_square / max(without.degrees_of_freedom, 1)
-        if score is not None:
-            difference = f"{score.elpd_diff:.1f} ± {score.dse:.1f}"
-            cells = (f"{score.elpd:.1f}", difference, f"{score.weight:.2f}", f"{score.model_probability:.2g}")
-        rows.append((one.name, str(count), f"{ratio:.3g}", f"{one.bic:.1f}", *cells))
-    hidden = len(search.candidates) - len(rows)
-    note = (
-        "First the cross-validated models, by elpd (sum of log predictive densities of held-out data); then the "
-        "others, by BIC with independent noise." + (f" There are {hidden} more." if hidden else "")
-    )
-    heads = ("from the top", "parameters", "chi2/dof", "BIC - best", "elpd", "elpd_diff ± dse", "weight", "probability")
-    return Table("Stacks", heads, tuple(rows), note)
+def search_table(search: Search) -> Table:
+    """The cross-validated stacks side by side, as `fits.compare` has them."""
+    rows = [ComparedFit(one.name, one.fit, one.model_score) for one in search.candidates if one.model_score is not None]
+    others = len(search.candidates) - len(rows)
+    notes = (f"{others} others were fitted with independent noise only",) if others else ()
+    return comparison_table(Comparison(tuple(rows), "elpd", "", notes, ComparisonOptions()))
 
 
 def search_sentences(search: Search) -> list[str]:

@@ -247,7 +247,7 @@ def search(arguments: Namespace) -> int:
     }
     with show_progress() as progress, hint(f"{directory} {RESUME}"):
         found = structure_search.search(data, **settings, directory=directory, progress=progress)
-    show(structure_search.search_table(found, 20), *structure_search.search_sentences(found), f"Fits: {directory}")
+    show(structure_search.search_table(found), *structure_search.search_sentences(found), f"Fits: {directory}")
     return DONE
 
 

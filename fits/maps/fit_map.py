@@ -86,12 +86,13 @@ def fit_map(
     if not path.resolve().parent.is_dir():
         raise ValueError(f"{path}: there is no directory {path.parent}")
     with connected(client, options.processes) as connection, locked(Path(f"{path}.lock"), str(path)):
-        return _fit(path, data, stack, noise, transport, replace(options, chunk_size=size), connection)
+        _fit(path, data, stack, noise, transport, replace(options, chunk_size=size), connection)
+    return open_map(path)
 
 
 def _fit(
     path: Path, data: MapData, stack: Any, noise: Noise | None, transport: Any, options: MapOptions, client: Any
-) -> FittedMap:
+) -> None:
     # 1. whose map it is
     identity = _identity(stack, noise, transport, data.samples, options) | {"measurements": data.fingerprint()}
     store = resume(path, identity, options.force)
@@ -121,15 +122,15 @@ def _fit(
         store = create(path, about, arrays)
 
     # 3. all chunks
-    job = job_of(store, problem, data.geometry is None, options, data)
+    job = job_of(store, problem, options, data)
     if failures := _fit_chunks(store, job, client, options):
-        named = [*failures[:NAMED], *([f"and {len(failures) - NAMED} more"] if len(failures) > NAMED else [])]
-        raise ValueError(f"{path}: {'; '.join(named)}; all other chunks are done, and another run does these")
+        more = f"; and {len(failures) - NAMED} more" if len(failures) > NAMED else ""
+        words = f"{'; '.join(failures[:NAMED])}{more}"
+        raise ValueError(f"{path}: {words}; all other chunks are done, and another run does these")
 
     # 4. neighbours held together
     if options.spatial_prior is not None:
         smooth_map(store, job, client, options)
-    return open_map(path)
 
 
 def _identity(stack: Any, noise: Noise | None, transport: Any, samples: int, options: MapOptions) -> dict[str, str]:
@@ -174,7 +175,7 @@ def _fit_chunks(store: Store, job: Job, client: Any, options: MapOptions) -> lis
         if isinstance(result, Failure):
             failures.append(f"chunk {block_words(blocks[index])}: {result.error}")
         else:
-            fitted, poor = fitted + result["fitted"], poor + result["poor"]
+            fitted, poor = fitted + result[0], poor + result[1]
         done += 1
         options.progress("map", done, total, f"{100.0 * poor / fitted:.1f} % poor" if fitted else "")
     if client is None:  # of a cluster, some may still write what others have done
@@ -182,17 +183,18 @@ def _fit_chunks(store: Store, job: Job, client: Any, options: MapOptions) -> lis
     return failures
 
 
-def work(job: Job, block: Block) -> dict[str, int]:
-    """Fit a chunk and write it; returns how many texels have which flag."""
+def work(job: Job, block: Block) -> tuple[int, int]:
+    """Fit a chunk and write it; returns how many texels are fitted, and how many of them are poor."""
     results = fit_chunk(job, block)
     job.store.write(block, results)
-    return {meaning: int(np.sum(results["flags"] & bit > 0)) for meaning, bit in FLAGS.items()}
+    fitted, poor = (int(np.sum(results["flags"] & FLAGS[meaning] > 0)) for meaning in ("fitted", "poor"))
+    return fitted, poor
 
 
 def fit_chunk(job: Job, block: Block) -> dict[str, NDArray[Any]]:
     """The arrays of a store for one chunk, by their names, each of the chunk's shape."""
     mask, texels = job.texels(block)
-    problem, size, shape, mask = job.problem, job.options.chunk_size, mask.shape, mask.reshape(-1)
+    problem, shape, mask = job.problem, mask.shape, mask.reshape(-1)
     names = problem.names
     results = {name: np.full(texels.number, fill, dtype) for name, (dtype, fill) in arrays_of(names).items()}
     results["measurements"][:] = texels.measurements
@@ -203,7 +205,7 @@ def fit_chunk(job: Job, block: Block) -> dict[str, NDArray[Any]]:
     fitted = np.flatnonzero(mask & enough)
     if len(fitted):
         rows = texels.rows(fitted)
-        best, poor, restarted = search(problem, job.starts, rows, size, job.options)
+        best, poor, restarted = search(problem, job.starts, rows, job.options)
         finite, (errors, at_bound, unidentified) = best.finite, standard_errors(problem, best, rows)
         numbers = {"reduced_chi_square": reduced_chi_square(best, rows)}
         for place, name in enumerate(names):

@@ -193,8 +193,7 @@ def common_table(map: FittedMap) -> Table:
 
 def made_table(map: FittedMap) -> Table:
     """How the map was made: the model but for the stack, the pilot, and options that are not the usual ones."""
-    about, pilot = map.attributes, map.attributes["pilot"]
-    limit = pilot["poor_above"]
+    about = map.attributes
     options = (f"{name} {value}" for name, value in about["options"].items() if value != getattr(MapOptions, name))
     rows = {
         "store": map.path,
@@ -202,7 +201,7 @@ def made_table(map: FittedMap) -> Table:
         **about["numerical"],
         "noise": about["noise"],
         "data": f"{about['samples']} measurements a texel, of {', '.join(about['channels'])}",
-        "median of the pilot": f"chi2/dof {pilot['reduced_chi_square'] or math.nan:.3g}; poor above {limit:.3g}",
+        "chi2/dof": f"poor above {about['pilot']['poor_above']:.3g}",
         "options": ", ".join(options) or "default",
         "fitted by": f"layerjax {about['version']}",
     }

