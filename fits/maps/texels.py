@@ -186,22 +186,13 @@ def fit_texels(
         fresh: whether starts are far from minima.
         most_steps: with 1 each ends where it begins, and what is known there is found.
     """
-    parts = []
-    for first in range(0, texels.number, size):
-        rows = np.arange(first, min(first + size, texels.number))
-        of = None if which is None else which[rows]
-        parts.append(_call(problem, units[rows], texels.rows(rows), size, known, of, fresh, most_steps)[0])
-    return Fits(*(np.concatenate(part) for part in zip(*parts, strict=True)))
+    return _run(problem, units, texels, size, size, known, which, fresh, most_steps)[0]
 
 
 def linearise_at(problem: Problem, units: Floats, size: int) -> Linearisation:
     """What the model says at K points (K, P) of the unit box, by the program that fits: it is compiled already."""
-    parts, nothing = [], make_texels(np.full((1, *problem.model.values.shape), np.nan))
-    for first in range(0, len(units), min(KNOWN, size)):
-        some = units[first : first + min(KNOWN, size)]
-        rows = nothing.rows(np.zeros(len(some), int))
-        parts.append(_call(problem, some, rows, size, None, None, False, 1)[1])
-    return Linearisation(*(np.concatenate(part) for part in zip(*parts, strict=True)))
+    nothing = make_texels(np.full((1, *problem.model.values.shape), np.nan)).rows(np.zeros(len(units), int))
+    return _run(problem, units, nothing, size, min(KNOWN, size), None, None, False, 1)[1]
 
 
 def to_units(problem: Problem, vectors: Floats) -> Floats:
@@ -250,33 +241,34 @@ def standard_errors(problem: Problem, fits: Fits, texels: Texels) -> tuple[Float
 # ---- the program ----
 
 
-def _call(
+def _run(
     problem: Problem,
     units: Floats,
     texels: Texels,
     size: int,
+    share: int,
     known: Linearisation | None,
     which: Integers | None,
     fresh: bool,
     most_steps: int,
 ) -> tuple[Fits, Linearisation]:
-    """Fits of at most `size` texels, and the model where the first `KNOWN` of them ended."""
-    count, shape = texels.number, problem.model.values.shape
-    rows = np.minimum(np.arange(-(-size // LANES) * LANES), count - 1)  # padded by the last, which is not computed
-    number_known, of = (0, np.zeros_like(rows)) if which is None else (count, which[rows])
+    """Fits of M texels, so many at a time; and the model where the first `KNOWN` of each share ended."""
+    shape, parts = problem.model.values.shape, []
     if known is None and texels.wi is None:
         known = Linearisation(np.zeros((1, *shape)), np.zeros((1, units.shape[1], *shape)))
     if known is not None:  # few numbers of starts, and of programs for them
         known = Linearisation(*(np.concatenate([one, np.repeat(one[-1:], -len(one) % KNOWN, axis=0)]) for one in known))
-    numbers = (np.asarray(one) for one in (count, number_known, fresh, most_steps))
-    found, said = problem.call(_program, units[rows], known, of, texels.rows(rows), *numbers)
-    return (
-        Fits(*(np.asarray(part)[:count] for part in found)),
-        Linearisation(*(np.asarray(part)[:count] for part in said)),
-    )
+    for first in range(0, texels.number, share):
+        count = min(share, texels.number - first)
+        rows = first + np.minimum(np.arange(-(-size // LANES) * LANES), count - 1)  # the last again is not computed
+        number_known, of = (0, np.zeros_like(rows)) if which is None else (count, which[rows])
+        numbers = [np.asarray(one) for one in (count, number_known, fresh, most_steps)]
+        found = problem.call(_program, units[rows], known, of, texels.rows(rows), *numbers)
+        parts.append(jax.tree.map(lambda part, count=count: np.asarray(part)[:count], found))
+    return jax.tree.map(lambda *some: np.concatenate(some), *parts)
 
 
-class _Run(NamedTuple):
+class _Descent(NamedTuple):
     """A texel on its way.
 
     rough: whether it goes by `sigma`, (N, C), which is held, as far from the data where levels of noise are free.
@@ -306,7 +298,7 @@ def _program(
     one = jax.eval_shape(begin, (units[0], texels.rows(0)))
     _, unravel = ravel_pytree(jax.tree.map(lambda part: jnp.zeros(part.shape, part.dtype), one))
 
-    def flat(run: _Run) -> Array:
+    def flat(run: _Descent) -> Array:
         return ravel_pytree(run)[0]
 
     # a row a texel: its start, after the first step where the model is known there
@@ -321,7 +313,7 @@ def _program(
     rows = jnp.concatenate([rows, rows[-1:]])  # the last is of lanes that have no texel
 
     # lanes take their steps, and one whose texel has ended the next texel
-    def tried(run: _Run, row: Texels) -> Linearisation:
+    def tried(run: _Descent, row: Texels) -> Linearisation:
         return _linearise(model_of(model, row), model.box.from_unit(run.state.trial))
 
     def body(carry: tuple[Any, ...]) -> tuple[Any, ...]:
@@ -376,17 +368,17 @@ def _linearise(model: Model, vector: Array) -> Linearisation:
     return Linearisation(values, jnp.concatenate([slopes, rest]))
 
 
-def _begin(model: Model, fresh: Array, start: tuple[Array, Texels]) -> _Run:
+def _begin(model: Model, fresh: Array, start: tuple[Array, Texels]) -> _Descent:
     """A texel at its start (P,), before the first step."""
     unit, own = start[0], model_of(model, start[1])
     levels = model.objective == "likelihood" and model.varying
     nothing = jnp.zeros((unit.size, *own.values.shape), unit.dtype)
     state = first_state(unit, jnp.where(fresh, FIRST_DAMPING, NEARBY), Linearisation(nothing[0], nothing))
     sigma, no = own.initial_sigma(model.box.from_unit(unit)) if levels else jnp.zeros(0), jnp.asarray(False)
-    return _Run(fresh & levels, sigma, state, no, no)
+    return _Descent(fresh & levels, sigma, state, no, no)
 
 
-def _step(model: Model, fresh: Array, most_steps: Array, run: _Run, row: Texels, trial: Linearisation) -> _Run:
+def _step(model: Model, fresh: Array, most_steps: Array, run: _Descent, row: Texels, trial: Linearisation) -> _Descent:
     """A texel after a step by what is known of its trial."""
     own = linear(model_of(model, row), trial, model.box.from_unit(run.state.trial))
     likelihood = model.objective == "likelihood"
@@ -419,10 +411,10 @@ def _step(model: Model, fresh: Array, most_steps: Array, run: _Run, row: Texels,
     if levels:  # near the data with sigma held: the same again with the levels of noise free
         begun = first_state(state.point, jnp.where(fresh, FIRST_DAMPING, NEARBY), state.auxiliary)
         state = jax.tree.map(partial(jnp.where, stop & run.rough), begun, state)
-    return _Run(run.rough & ~stop, run.sigma, state, stop & ~run.rough, converged & jnp.isfinite(state.cost))
+    return _Descent(run.rough & ~stop, run.sigma, state, stop & ~run.rough, converged & jnp.isfinite(state.cost))
 
 
-def _results(model: Model, run: _Run, row: Texels) -> Fits:
+def _results(model: Model, run: _Descent, row: Texels) -> Fits:
     """What is known where a texel ended."""
     own, unit, cost = model_of(model, row), run.state.point, run.state.cost
     vector, predicted, finite = model.box.from_unit(unit), run.state.auxiliary.values, jnp.isfinite(cost)
