@@ -55,12 +55,8 @@ def run(
         threads: so many; None: one a core. With 1 the calling thread executes the tasks.
 
     Yields:
-        (index, result). The result is a `Failure` if `work` raised ValueError or OSError, or its worker died four
-        times. A full disk and all other errors end the run.
-
-    Raises:
-        ValueError: as `connected`; `work`, `shared` or a task that cannot be sent to a worker.
-        OSError: no such scheduler, or one that has stopped.
+        (index, result): a `Failure` if `work` raised ValueError or OSError, or its worker died four times. A full disk,
+        all other errors, and a scheduler that stops end the run.
     """
     with connected(client, processes) as connection:
         if connection is None:
@@ -79,12 +75,8 @@ def connected(client: Any, processes: int = 1) -> Iterator[Any]:
         processes: without a client, so many processes of this machine with one thread each, if there are several: a
             script then needs ``if __name__ == "__main__":``.
 
-    Raises:
-        ValueError: processes < 1; no client and no address; no `distributed`; workers that cannot start.
-        OSError: no such scheduler.
+    ValueError: no client and no address; no `distributed`; workers that cannot start. OSError: no such scheduler.
     """
-    if processes < 1:
-        raise ValueError(f"processes is {processes}; it must be at least 1")
     if client is None and processes == 1:
         yield None
         return

@@ -1,22 +1,17 @@
-"""Work that survives: what grows while it is computed, each finished piece a record of one SQLite file.
+"""Work that survives: starts, steps of a chain, candidates of a search, rows of a batch, each a record of a SQLite file.
 
-The starts of a fit, the steps of a chain, the candidates of a search and the rows of a batch are kept in this way. A
-record is written in a transaction, so that a process which is killed, or a disk which is full, costs the record that
-was being written and no other. SQLite's rollback journal is used, not its write-ahead log, which does not work on
-network file systems.
-
-One process writes, and holds a lock file beside the store while it does. Readers take a copy: they need no lock, change
-nothing, and hold up nobody. Every record carries a checksum, so that damage is reported instead of read. A fingerprint
-says whose work the store holds; the work of another problem is refused.
+A record is written in a transaction, so that a process which is killed, or a disk which is full, costs the record that
+was being written and no other; with SQLite's rollback journal, as its write-ahead log does not work on network file
+systems. One process writes, and holds a lock file beside the store while it does. Readers take a copy: they need no
+lock, change nothing, and hold up nobody. Every record carries a checksum, so that damage is reported instead of read. A
+fingerprint says whose work the store holds; the work of another problem is refused.
 
     with Store.open("chain.store", fingerprint(data=values, seed=0)) as store:
-        store.put("moves", {"kind": "stretch"})                        # one record a key, the last one counts
-        store.append("steps", {"coords": coords, "log_prob": log_prob, "random_state": state})
-    posterior = Store.read("chain.store")
-    steps = posterior.all("steps")                                     # in the order in which they were appended
+        store.put("moves", {"kind": "stretch"})                   # one record a key, the last one counts
+        store.append("steps", {"coords": coords, "log_prob": log_prob})
+    steps = Store.read("chain.store").all("steps")                # in the order in which they were appended
 
-A record is what JSON can hold (lists come back in place of tuples), with numpy arrays anywhere inside: of a chain, for
-instance, arrays (steps, walkers, P) and (steps, walkers) and the state of the random generator.
+A record is what JSON can hold (lists come back in place of tuples), with numpy arrays anywhere inside.
 """
 
 import base64

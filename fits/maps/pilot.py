@@ -177,13 +177,8 @@ def make_prototype(
 def fit_pilot(
     problem: Problem, texels: Texels, shape: tuple[int, ...], options: MapOptions
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Find resolution, emulator, common parameters and starts from the pilot texels of a map of this shape.
-
-    Returns what a store keeps of that: arrays, and what its root says.
-
-    Raises:
-        ValueError: an emulator is required that cannot be made, or no texel has a fit.
-    """
+    """Resolution, emulator, common parameters and starts, from the pilot texels of a map of this shape: the arrays that
+    a store keeps of them, and what its root says. ValueError: there is no emulator that is required, or no fit."""
     own_directions = texels.wi is not None
     texels = texels.rows(texels.measurements >= len(problem.names)).with_floor(least_floor(problem))
 

@@ -37,14 +37,8 @@ NO_VALUE = "#d4d4d4"
 
 @dataclass(frozen=True)
 class Summary:
-    """Counts of texels, and quartiles over those that are fitted.
-
-    Attributes:
-        texels, done: texels of the map, and of them those that are fitted or excluded.
-        counts: texels with each flag.
-        at_bound: texels at which each parameter is at a bound.
-        quartiles: of each array of the store, such as "values/base.albedo", where it is finite; NaN if it nowhere is.
-    """
+    """Counts of texels: of the map, of those that are fitted or excluded, with each flag, and with each parameter at a
+    bound; and quartiles of each array of the store over the fitted texels where it is finite, NaN if it nowhere is."""
 
     texels: int
     done: int
@@ -219,11 +213,7 @@ def fragment(map: FittedMap) -> str:
 
 
 def report(map: FittedMap, path: str | Path, force: bool = True, progress: Progress = silent) -> Summary:
-    """Write the report of a map to `path`, whole or not at all; returns its numbers.
-
-    Raises:
-        ValueError: `path` exists and `force` is False, or a chunk of the map is damaged.
-    """
+    """Write the report of a map to `path`, whole or not at all, see `fits.report`; returns its numbers."""
     numbers, title = summarise(map), f"Map of {map.path.resolve().name}"
     body = [f"<h1>{html.escape(title)}</h1>", verdict_box(*verdict(numbers, map))]
     flags = _figures(map, ("The gravest flag of each texel.", flag_picture(map.flags)))
@@ -265,13 +255,7 @@ def _figures(map: FittedMap, *figures: tuple[str, Figure]) -> str:
 
 
 def value_picture(values: Floats, title: str, label: str, colours: str, norm: Normalize) -> Figure:
-    """One number of every texel, such as a parameter or its error; grey where it is not finite.
-
-    Args:
-        values: of the whole map.
-        title, label: what stands above, and what the numbers are, with their unit.
-        colours, norm: of matplotlib.
-    """
+    """One number of every texel, such as a parameter or its error; grey where it is not finite."""
     finite, cmap = np.isfinite(values), mpl.colormaps[colours].with_extremes(bad=NO_VALUE)
     legend = {} if finite.all() else {NO_VALUE: "no value"}
     return _map_picture(np.where(finite, values, np.nan), title, legend, label, cmap=cmap, norm=norm)

@@ -35,11 +35,9 @@ def neighbour_prior(kind: Kind, scales: Floats, units: Floats, fitted: Truths) -
     """The Gaussian by which the neighbours of each texel hold it: its centre in the unit box and its precision, 0 where
     no edge ends, (map shape, P) each.
 
-    Its logarithm and that of the spatial prior have the same slope where the texel is, and it lies below elsewhere:
-    what lowers the cost with it lowers that with the spatial prior at least as much.
-
-    scales: (P,), infinite where a parameter is not smoothed. units: (map shape, P), in the unit box, finite where
-    `fitted`, (map shape).
+    Its logarithm has the slope of the spatial prior's where the texel is, and lies below it elsewhere: what lowers the
+    cost with it lowers that with the spatial prior. scales: (P,), infinite where a parameter is not smoothed. units:
+    (map shape, P), finite where `fitted`, (map shape).
     """
     total, moment = np.zeros((2, *units.shape))
     with np.errstate(invalid="ignore"):
@@ -56,11 +54,8 @@ def neighbour_prior(kind: Kind, scales: Floats, units: Floats, fitted: Truths) -
 
 
 class Half(NamedTuple):
-    """The texels of one colour in a chunk.
-
-    places: of M texels in the block, counted along its axes. units: where they are, (M, P), in the unit box. centre,
-    inverse_sd: how strongly their neighbours hold them, see `Texels`.
-    """
+    """The texels of one colour in a chunk: M places in the block, counted along its axes; where they are, (M, P), in
+    the unit box; and how strongly their neighbours hold them, see `Texels`."""
 
     block: Block
     places: NDArray[np.int64]
@@ -82,9 +77,7 @@ def work(job: Job, task: Half) -> tuple[Floats, Floats]:
 def smooth_map(store: Store, job: Job, client: Any, options: MapOptions) -> None:
     """Smooth a map that is fitted whole, into a group of its store, from where an earlier call stopped.
 
-    Raises:
-        ValueError: measurements that cannot be read again: they are named, and what was done of whole rounds is kept.
-        OSError: of the store.
+    ValueError: measurements that cannot be read again; whole rounds are kept.
     """
     names, problem, prior = store.names, job.problem, options.spatial_prior
     assert prior is not None

@@ -324,9 +324,8 @@ def _write_group(group: zarr.Group, arrays: Mapping[str, np.ndarray], about: Map
 def create(path: Path, attributes: Mapping[str, Any], pilot: Mapping[str, np.ndarray]) -> Store:
     """Make a store without texels, whole or not at all, in place of what is there.
 
-    attributes: what the root says under the key "layerjax": the names of the parameters, at most 32 (the bits of
-    ``at_bound``), their units, the shape and the chunk (texels along each axis) of the map, and how it was fitted.
-    pilot: arrays that all chunks are fitted with.
+    attributes: what the root says under the key "layerjax": names and units of the parameters, shape and chunk (texels
+    along each axis) of the map, and how it was fitted. pilot: arrays that all chunks are fitted with.
     """
     names, units, shape = attributes["names"], attributes["units"], tuple(attributes["shape"])
     axes = {1: ["texel"], 2: ["row", "column"]}.get(len(shape), [f"axis_{axis}" for axis in range(len(shape))])
@@ -348,16 +347,8 @@ def create(path: Path, attributes: Mapping[str, Any], pilot: Mapping[str, np.nda
 
 
 def resume(path: Path, identity: Mapping[str, str], force: bool) -> Store | None:
-    """The store that is there, if it is of the same fit, without what killed writers left; None: there is none, or one
-    to be replaced.
-
-    Args:
-        identity: fingerprints of what makes this fit, by name.
-        force: replace a map of another fit, or a damaged one.
-
-    Raises:
-        ValueError: something else is there, or a map of another fit (it names what differs), or a damaged one.
-    """
+    """The store that is there, if it is of the fit with these fingerprints; None: there is none, or one that `force`
+    replaces. ValueError: a map of another fit (it names what differs), a damaged one, or something else."""
     restore(path)
     if not os.path.lexists(path):
         return None
