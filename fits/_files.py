@@ -47,6 +47,16 @@ def require_there(path: str | Path, what: str = "no such file") -> None:
         raise FileNotFoundError(errno.ENOENT, what, str(path))
 
 
+def require_free_place(path: Path, force: bool) -> None:
+    """ValueError unless a file can be written there, and none would be overwritten without `force`."""
+    if path.is_dir():
+        raise ValueError(f"{path}: is a directory, must be a file")
+    if not path.parent.is_dir():
+        raise ValueError(f"{path}: there is no directory {path.parent}")
+    if path.exists() and not force:
+        raise ValueError(f"{path}: the file exists already (--force, or force=True, overwrites it)")
+
+
 def write_text(path: str | Path, text: str, force: bool = False) -> None:
     """Write a UTF-8 text file; an existing file is a ValueError unless `force`."""
     write_bytes(path, text.encode(), force)
@@ -57,10 +67,7 @@ def write_bytes(path: str | Path, content: bytes, force: bool = False) -> None:
     OSError names the file."""
     path = given_path("path", path)
     require_switch("force", force)
-    if path.exists() and not force:
-        raise ValueError(f"{path}: the file exists already (--force, or force=True, overwrites it)")
-    if not path.parent.is_dir():
-        raise ValueError(f"{path}: there is no directory {path.parent}")
+    require_free_place(path, force)
     temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}{PARTIAL}")
     with named(path):
         try:

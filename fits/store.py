@@ -1,4 +1,4 @@
-"""Work that survives: starts, steps of a chain, candidates of a search, rows of a batch, each a record of a SQLite file.
+"""Work that survives: starts, chains, candidates of a search, rows of a batch, each piece a record of one SQLite file.
 
 A record is written in a transaction, so that a process which is killed, or a disk which is full, costs the record that
 was being written and no other; with SQLite's rollback journal, as its write-ahead log does not work on network file

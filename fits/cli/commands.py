@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fits._files import write_bytes, write_text
-from fits.cli.input_output import DONE, DOUBTFUL, hint, read_options, refuse_alone, require_free_place, show, use_jax
+from fits.cli.input_output import DONE, DOUBTFUL, hint, read_options, refuse_alone, require_place, show, use_jax
 from fits.data.geometry import slices
 from fits.data.measurements import Measurements
 from fits.data.totals import Totals
@@ -97,7 +97,7 @@ def predict(arguments: Namespace) -> int:
     if not scored and out is None:
         raise ValueError("predict --incidence needs --out FILE")
     refuse_alone(arguments, ("azimuth",) if scored else ("select", "read"), "incidence" if scored else "score")
-    require_free_place(out, arguments.force, ".csv", "predictions")
+    require_place(out, arguments.force, ".csv", "predictions")
     use_jax()
     from fits.prediction.predict import predict as run_prediction
     from fits.reports import tables
@@ -128,7 +128,7 @@ def report(arguments: Namespace) -> int:
     from fits.reports import results
     from fits.reports.html import FitReport
 
-    require_free_place(arguments.out, arguments.force)
+    require_place(arguments.out, arguments.force)
     result, posterior = results.load_fit(directory), results.load_posterior(directory)
     others, held_out = _candidates(arguments.compare), results.load_held_out(directory)
     out = arguments.out or directory / results.REPORT
@@ -212,7 +212,7 @@ def _report_map(store: Path, arguments: Namespace) -> int:
     if arguments.compare:
         raise ValueError(f"--compare: {store} is a map, which is not compared with others")
     out = arguments.out or (store if store.name else store.resolve()).with_suffix(".html")
-    require_free_place(out, arguments.force)
+    require_place(out, arguments.force)
     from fits.maps import report
     from fits.maps.store import open_map
 
@@ -283,7 +283,7 @@ def info(arguments: Namespace) -> int:
     from fits.reports.tables import Table
 
     out, force = arguments.out or f"{Path(arguments.data).stem}.png", arguments.force
-    require_free_place(arguments.out, force, ".png", "pictures")
+    require_place(arguments.out, force, ".png", "pictures")
     data = read_options(arguments).read(arguments.data)
     show(Table(data.source.path, ("", ""), source_rows(data)), data_table(data), *data_statements(data))
     if Path(out).exists() and not force:
@@ -297,7 +297,7 @@ def info(arguments: Namespace) -> int:
 
 def convert(arguments: Namespace) -> int:
     """Read any supported format and write csv."""
-    require_free_place(arguments.out, arguments.force, ".csv", "measurements")
+    require_place(arguments.out, arguments.force, ".csv", "measurements")
     return _write_measurements(read_options(arguments).read(arguments.data), arguments)
 
 
@@ -320,7 +320,7 @@ def _write_measurements(data: Measurements, arguments: Namespace) -> int:
 
 def simulate(arguments: Namespace) -> int:
     """Write simulated measurements of a stack; noise, scale and instrument of its file are not simulated."""
-    require_free_place(arguments.out, arguments.force, ".csv", "measurements")
+    require_place(arguments.out, arguments.force, ".csv", "measurements")
     use_jax()
     from fits.problem.parameters import at_start
     from fits.problem.simulate import simulate as run_simulation
@@ -335,7 +335,7 @@ def simulate(arguments: Namespace) -> int:
 
 def render(arguments: Namespace) -> int:
     """Draw a material of the gallery, or of a file, or the best of a saved fit."""
-    require_free_place(arguments.out, arguments.force, ".png", "pictures")
+    require_place(arguments.out, arguments.force, ".png", "pictures")
     use_jax()
     from fits.optimise.result import Fit
     from fits.reports.plots.data import as_png
@@ -357,7 +357,7 @@ def render(arguments: Namespace) -> int:
 
 def export(arguments: Namespace) -> int:
     """Write a material, or the best of a saved fit, for renderers or for optical design."""
-    require_free_place(arguments.out, arguments.force)
+    require_place(arguments.out, arguments.force)
     use_jax()
     from fits.exports.export import export as run_export
 

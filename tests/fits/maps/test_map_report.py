@@ -196,7 +196,7 @@ def test_the_command_writes_the_page_beside_the_store_or_says_why_not(tmp_path, 
     zarr.create_group(tmp_path / "other.zarr")
     os.truncate(map.path / "flags" / "c" / "0" / "1", 3)
     for words, message in (
-        ("a.zarr", "exists already (--force overwrites it)"),
+        ("a.zarr", "exists already (--force, or force=True, overwrites it)"),
         ("a.zarr --force", "flags: damaged, "),
         ("a.zarr --compare b", "is not compared"),
         ("a.zarr --out none/a.html", "no directory none"),
