@@ -19,7 +19,7 @@ import layerjax as lj
 from fits._files import given_path, locked
 from fits.data.geometry import direction
 from fits.engines import Failure, connected, run
-from fits.maps.inputs import Block, MapData, block_words, map_data
+from fits.maps.inputs import Block, block_words, map_data
 from fits.maps.options import DEFAULT, VERDICTS, MapOptions
 from fits.maps.pilot import Job, fit_pilot, job_of, make_prototype, pilot_texels
 from fits.maps.search import reduced_chi_square, search
@@ -79,61 +79,56 @@ def fit_map(
     require_kind("noise", noise, Noise, None)
     if options.instrument is not None and data.geometry is None:
         raise ValueError("instrument is given, but every texel has directions of its own; there can be no instrument")
-    if noise is not None and not noise.use_sigma:
+    noise = noise or Noise()
+    if not noise.use_sigma:
         data = replace(data, sigma=None)
     size = min(options.chunk_size, max(MapOptions.chunk_size, math.prod(data.shape)))  # no program for a million texels
-    path = given_path("out", out)
+    options, path = replace(options, chunk_size=size), given_path("out", out)
     if not path.resolve().parent.is_dir():
         raise ValueError(f"{path}: there is no directory {path.parent}")
     with connected(client, options.processes) as connection, locked(Path(f"{path}.lock"), str(path)):
-        _fit(path, data, stack, noise, transport, replace(options, chunk_size=size), connection)
+        # 1. whose map it is
+        identity = _identity(stack, noise, transport, data.samples, options) | {"measurements": data.fingerprint()}
+        store = resume(path, identity, options.force)
+
+        # 2. the pilot: what all chunks have in common
+        if options.instrument is not None:  # the floor of a map's noise stands in one place
+            noise = with_floor(noise, options.instrument)
+            options = replace(options, instrument=replace(options.instrument, floor=None))
+        texels = pilot_texels(data, options.pilot_texels)
+        problem = make_prototype(texels, data, stack, noise, transport, options)
+        if store is None:
+            arrays, about = fit_pilot(problem, texels, data.shape, options)
+            names = [name for name in problem.names if name not in about["common"]]
+            about |= {
+                "names": names,
+                "units": {name: problem.units[name] for name in names},
+                "shape": data.shape,
+                "chunk": tile(data.shape, options.chunk_size),
+                "samples": data.samples,
+                "channels": list(problem.data.channels),
+                "options": options.numbers(),
+                "stack": repr(stack),
+                "noise_assumed": problem.objective == "likelihood" and is_assumed(noise, problem.data),
+                "version": lj.__version__,
+                "fingerprints": identity,
+            }
+            store = create(path, about, arrays)
+
+        # 3. all chunks
+        job = job_of(store, problem, options, data)
+        if failures := _fit_chunks(store, job, connection, options):
+            more = f"; and {len(failures) - NAMED} more" if len(failures) > NAMED else ""
+            words = f"{'; '.join(failures[:NAMED])}{more}"
+            raise ValueError(f"{path}: {words}; all other chunks are done, and another run does these")
+
+        # 4. neighbours held together
+        if options.spatial_prior is not None:
+            smooth_map(store, job, connection, options)
     return open_map(path)
 
 
-def _fit(
-    path: Path, data: MapData, stack: Any, noise: Noise | None, transport: Any, options: MapOptions, client: Any
-) -> None:
-    # 1. whose map it is
-    identity = _identity(stack, noise, transport, data.samples, options) | {"measurements": data.fingerprint()}
-    store = resume(path, identity, options.force)
-
-    # 2. the pilot: what all chunks have in common
-    if options.instrument is not None:  # the floor of a map's noise stands in one place
-        noise = with_floor(noise or Noise(), options.instrument)
-        options = replace(options, instrument=replace(options.instrument, floor=None))
-    texels = pilot_texels(data, options.pilot_texels)
-    problem = make_prototype(texels, data, stack, noise, transport, options)
-    if store is None:
-        arrays, about = fit_pilot(problem, texels, data.shape, options)
-        names = [name for name in problem.names if name not in about["common"]]
-        about |= {
-            "names": names,
-            "units": {name: problem.units[name] for name in names},
-            "shape": data.shape,
-            "chunk": tile(data.shape, options.chunk_size),
-            "samples": data.samples,
-            "channels": list(problem.data.channels),
-            "options": options.numbers(),
-            "stack": repr(stack),
-            "noise_assumed": problem.objective == "likelihood" and is_assumed(noise or Noise(), problem.data),
-            "version": lj.__version__,
-            "fingerprints": identity,
-        }
-        store = create(path, about, arrays)
-
-    # 3. all chunks
-    job = job_of(store, problem, options, data)
-    if failures := _fit_chunks(store, job, client, options):
-        more = f"; and {len(failures) - NAMED} more" if len(failures) > NAMED else ""
-        words = f"{'; '.join(failures[:NAMED])}{more}"
-        raise ValueError(f"{path}: {words}; all other chunks are done, and another run does these")
-
-    # 4. neighbours held together
-    if options.spatial_prior is not None:
-        smooth_map(store, job, client, options)
-
-
-def _identity(stack: Any, noise: Noise | None, transport: Any, samples: int, options: MapOptions) -> dict[str, str]:
+def _identity(stack: Any, noise: Noise, transport: Any, samples: int, options: MapOptions) -> dict[str, str]:
     """Fingerprints of what makes a fit, by name; of a transport that is a function, by what it predicts."""
 
     def parts_of(tree: Any) -> list[Any]:

@@ -123,13 +123,12 @@ def pilot_texels(data: MapData, count: int) -> Texels:
 
 
 def make_prototype(
-    pilot: Texels, data: MapData, stack: Any, noise: Noise | None, transport: Any, options: MapOptions
+    pilot: Texels, data: MapData, stack: Any, noise: Noise, transport: Any, options: MapOptions
 ) -> Problem:
     """A problem with the measurements of a typical texel, in whose place those of each texel come.
 
     ValueError for one that a map cannot have.
     """
-    noise = Noise() if noise is None else noise
     if noise.discrepancy:
         raise ValueError("noise.discrepancy is given; fits of maps have independent noise only")
 
