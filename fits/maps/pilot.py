@@ -45,13 +45,8 @@ MOST_PARAMETERS = 32
 class Job:
     """What all chunks of a map have in common, for those who do the work.
 
-    Attributes:
-        path: of the store.
-        prototype: the problem of a texel, with common parameters held, and a resolution.
-        emulator: in the place of its transport; None: that itself.
-        starts: of all fits but those of the pilot.
-        options: of the map; its chunk size is that of the program.
-        data: the measurements.
+    path: of the store. prototype: the problem of a texel, with common parameters held, and a resolution. emulator: in
+    the place of its transport, if any. starts: of the fits of all chunks. options: their chunk size is the program's.
     """
 
     path: str

@@ -295,8 +295,7 @@ def _program(
 ) -> tuple[Fits, Linearisation]:
     """Fits of the first `number` of M texels, from starts (M, P), of which so many are known at `which` of `known`."""
     begin, step = partial(_begin, model, fresh), partial(_step, model, fresh, most_steps)
-    one = jax.eval_shape(begin, (units[0], texels.rows(0)))
-    _, unravel = ravel_pytree(jax.tree.map(lambda part: jnp.zeros(part.shape, part.dtype), one))
+    _, unravel = ravel_pytree(jax.tree.map(jnp.zeros_like, jax.eval_shape(begin, (units[0], texels.rows(0)))))
 
     def flat(run: _Descent) -> Array:
         return ravel_pytree(run)[0]
@@ -318,7 +317,7 @@ def _program(
 
     def body(carry: tuple[Any, ...]) -> tuple[Any, ...]:
         following, lanes, runs, rows = carry
-        own = texels_at(lanes)
+        own = jax.tree.map(lambda part: part[jnp.minimum(lanes, len(units) - 1)], texels)
         # as a loop of one turn: all that follows would else compute the model again where it needs a part of it
         said = jax.lax.fori_loop(0, jnp.minimum(number, 1), lambda *_: jax.vmap(tried)(runs, own), nothing)
         runs = jax.vmap(step)(runs, own, said)
@@ -330,9 +329,6 @@ def _program(
         next_runs = jax.vmap(unravel)(rows[lanes])  # where a lane resumes, what it has just written
         return following + jnp.sum(runs.stopped), lanes, next_runs, rows
 
-    def texels_at(lanes: Array) -> Texels:
-        return jax.tree.map(lambda part: part[jnp.minimum(lanes, len(units) - 1)], texels)
-
     lanes = jnp.where(jnp.arange(LANES) < number, jnp.arange(LANES), len(units))
     runs = jax.vmap(unravel)(rows[lanes])
     nothing = jax.tree.map(jnp.zeros_like, runs.state.auxiliary)
@@ -340,13 +336,14 @@ def _program(
     *_, rows = jax.lax.while_loop(lambda carry: jnp.any(carry[1] < number), body, carry)
 
     # what is known where they ended
+    def result(row: tuple[Array, Texels]) -> Fits:
+        return _results(model, unravel(row[0]), row[1])
+
     ends = (rows[:-1], texels)
-    shapes = jax.eval_shape(
-        lambda row: _results(model, unravel(row[0]), row[1]), jax.tree.map(lambda part: part[0], ends)
+    empty = jax.tree.map(jnp.zeros_like, jax.eval_shape(jax.vmap(result), ends))
+    return first_mapped(result, ends, number, empty), jax.vmap(lambda row: unravel(row).state.auxiliary)(
+        rows[: min(KNOWN, len(units))]
     )
-    empty = jax.tree.map(lambda part: jnp.zeros((len(units), *part.shape), part.dtype), shapes)
-    found = first_mapped(lambda row: _results(model, unravel(row[0]), row[1]), ends, number, empty)
-    return found, jax.vmap(lambda row: unravel(row).state.auxiliary)(rows[: min(KNOWN, len(units))])
 
 
 def first_mapped(one: Callable[[Any], Any], rows: Any, number: Array, otherwise: Any) -> Any:
