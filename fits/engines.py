@@ -112,27 +112,21 @@ def local_cluster(processes: int) -> Iterator[Any]:
     """A client of so many processes of this machine with one thread each."""
     from distributed import Client, LocalCluster
 
-    logger = logging.getLogger("distributed")
-    level = logger.level
-    logger.setLevel(logging.CRITICAL)  # of workers that are killed and started again
     try:
         cluster = LocalCluster(
             n_workers=processes,
             threads_per_worker=1,
             memory_limit=0,
             dashboard_address=":0",
-            silence_logs=logging.CRITICAL,
+            silence_logs=logging.CRITICAL,  # of workers that are killed and started again
             env=environment(),
             preload=__name__,
         )
     except Exception as error:  # its kind differs between versions
         guard = 'something ends them, or a script has no `if __name__ == "__main__":` around its statements'
         raise ValueError(f"worker processes cannot start ({one_line(error)}): {guard}") from None
-    try:
-        with cluster, Client(cluster, set_as_default=False) as client:
-            yield client
-    finally:
-        logger.setLevel(level)
+    with cluster, Client(cluster, set_as_default=False) as client:
+        yield client
 
 
 # ---- threads of this process ----
