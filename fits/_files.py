@@ -4,8 +4,8 @@ import errno
 import json
 import math
 import os
+import secrets
 import shutil
-import tempfile
 import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -16,8 +16,6 @@ import numpy as np
 
 CHECKSUM = "checksum"
 PARTIAL = ".partial"  # how names of directories end, here and in zarr, that have not been written to their end
-_UMASK = os.umask(0)  # it can only be read by setting it: once, before other threads make files
-os.umask(_UMASK)
 
 
 def given_path(name: str, path: object) -> Path:
@@ -49,6 +47,16 @@ def require_there(path: str | Path, what: str = "no such file") -> None:
         raise FileNotFoundError(errno.ENOENT, what, str(path))
 
 
+def require_free_place(path: Path, force: bool) -> None:
+    """ValueError unless a file can be written there, and none would be overwritten without `force`."""
+    if path.is_dir():
+        raise ValueError(f"{path}: is a directory, must be a file")
+    if not path.parent.is_dir():
+        raise ValueError(f"{path}: there is no directory {path.parent}")
+    if path.exists() and not force:
+        raise ValueError(f"{path}: the file exists already (--force, or force=True, overwrites it)")
+
+
 def write_text(path: str | Path, text: str, force: bool = False) -> None:
     """Write a UTF-8 text file; an existing file is a ValueError unless `force`."""
     write_bytes(path, text.encode(), force)
@@ -59,20 +67,14 @@ def write_bytes(path: str | Path, content: bytes, force: bool = False) -> None:
     OSError names the file."""
     path = given_path("path", path)
     require_switch("force", force)
-    if path.exists() and not force:
-        raise ValueError(f"{path}: the file exists already (--force, or force=True, overwrites it)")
-    if not path.parent.is_dir():
-        raise ValueError(f"{path}: there is no directory {path.parent}")
+    require_free_place(path, force)
+    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}{PARTIAL}")
     with named(path):
-        descriptor, temporary = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
         try:
-            with os.fdopen(descriptor, "wb") as file:
-                file.write(content)
-            os.chmod(temporary, permissions(0o666))  # mkstemp makes files that only their owner can read
+            temporary.write_bytes(content)
             os.replace(temporary, path)
-        except BaseException:
-            os.unlink(temporary)
-            raise
+        finally:
+            temporary.unlink(missing_ok=True)
 
 
 @contextmanager
@@ -178,8 +180,3 @@ def locked(path: Path, what: str) -> Iterator[None]:
         with suppress(OSError):  # Windows does not delete open files
             path.unlink()  # while it is held: a process that opened it before sees that it is deleted
         lock.release()
-
-
-def permissions(mode: int) -> int:
-    """The mode without the bits of the user's umask."""
-    return mode & ~_UMASK

@@ -61,15 +61,7 @@ def fit_file(
 ) -> FitReport:
     """Fit what a stack file says and write the result directory, whole or not at all: what `layerjax fit` does.
 
-    Args:
-        directory, force: as of `save_fit`.
-        problem: the stack file.
-        data, held_out: what is fitted, and what its prediction is scored by.
-        starts, seed, progress: see `fit`; starts are kept beside the directory until it is there.
-        report: write it and its pictures, which take longer than a fit of a transport in closed form.
-
-    Raises:
-        ValueError: as `fit` and `save_fit`; data are held out of an objective that has no predictive score.
+    Starts are kept beside the directory until it is there. ValueError: as `fit`, `save_fit` and `require_score`.
     """
     require_score(problem, held_out is not None)
     target, stage = Path(directory).resolve(), "pictures and report"

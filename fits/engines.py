@@ -14,11 +14,11 @@ import pickle
 import signal
 import sys
 import threading
-import uuid
 import warnings
 from collections.abc import Callable, Iterable, Iterator
 from concurrent import futures
 from contextlib import contextmanager, suppress
+from functools import lru_cache
 from itertools import islice
 from multiprocessing import current_process
 from typing import Any, NamedTuple
@@ -26,8 +26,6 @@ from typing import Any, NamedTuple
 TIMEOUT = 60.0  # seconds to wait for the first worker
 
 FULL = (errno.ENOSPC, errno.EDQUOT)  # errors of a full disk, which affect every task
-
-SCRIPT_REPEATED = 78  # exit code of a worker that runs its parent's script to the point where that starts workers
 
 Work = Callable[[Any, Any], Any]
 
@@ -53,17 +51,12 @@ def run(
         work: called as `work(shared, task)`; a function that workers can import, if it is not sent with its code.
         shared: data of all tasks; each worker receives them once.
         tasks: any number of them.
-        processes, client: see `connected`; without either, threads of this process, one a core: the first task runs by
-            itself, as it compiles.
-        threads: threads of this process; None: one a core. With 1 the calling thread executes the tasks.
+        processes, client: see `connected`; without either, threads of this process.
+        threads: so many; None: one a core. With 1 the calling thread executes the tasks.
 
     Yields:
-        (index, result). The result is a `Failure` if `work` raised ValueError or OSError, or its worker died four
-        times. A full disk and all other errors end the run.
-
-    Raises:
-        ValueError: as `connected`; `work`, `shared` or a task that cannot be sent to a worker.
-        OSError: no such scheduler, or one that has stopped.
+        (index, result): a `Failure` if `work` raised ValueError or OSError, or its worker died four times. A full disk,
+        all other errors, and a scheduler that stops end the run.
     """
     with connected(client, processes) as connection:
         if connection is None:
@@ -82,41 +75,36 @@ def connected(client: Any, processes: int = 1) -> Iterator[Any]:
         processes: without a client, so many processes of this machine with one thread each, if there are several: a
             script then needs ``if __name__ == "__main__":``.
 
-    Raises:
-        ValueError: processes < 1; no client and no address; no `distributed`; workers that cannot start.
-        OSError: no such scheduler.
+    ValueError: no client and no address; no `distributed`; workers that cannot start. OSError: no such scheduler.
     """
-    if processes < 1:
-        raise ValueError(f"processes is {processes}; it must be at least 1")
     if client is None and processes == 1:
         yield None
         return
     if getattr(current_process(), "_inheriting", False):  # a worker that runs its parent's script, which has no guard
-        sys.exit(SCRIPT_REPEATED)
+        sys.exit(78)
     try:
         from distributed import Client
     except ImportError:
         needs = "processes > 1 needs" if client is None else "client= needs"
         raise ValueError(f'{needs} distributed: pip install "layerjax[distributed]"') from None
-    if isinstance(client, Client) and not client.asynchronous:
-        yield client
-        return
     if client is None:
         with local_cluster(processes) as connection:
             yield connection
-        return
-    if not (isinstance(client, str) and "://" in client):
+    elif isinstance(client, Client) and not client.asynchronous:
+        yield client
+    elif isinstance(client, str) and "://" in client:
+        try:
+            connection = Client(client, set_as_default=False)
+        except (OSError, ValueError) as error:
+            raise OSError(f"{client}: there is no scheduler ({one_line(error)})") from None
+        try:
+            yield connection
+        finally:
+            with suppress(Exception):
+                connection.close(timeout=1)
+    else:
         wanted = "a distributed.Client, or the address of a scheduler, such as tcp://node1:8786"
         raise ValueError(f"client is {client!r}; it must be {wanted}")
-    try:
-        connection = Client(client, set_as_default=False)
-    except (OSError, ValueError) as error:
-        raise OSError(f"{client}: there is no scheduler ({one_line(error)})") from None
-    try:
-        yield connection
-    finally:
-        with suppress(Exception):
-            connection.close(timeout=1)
 
 
 @contextmanager
@@ -124,27 +112,21 @@ def local_cluster(processes: int) -> Iterator[Any]:
     """A client of so many processes of this machine with one thread each."""
     from distributed import Client, LocalCluster
 
-    logger = logging.getLogger("distributed")
-    level = logger.level
-    logger.setLevel(logging.CRITICAL)  # of workers that are killed and started again
     try:
         cluster = LocalCluster(
             n_workers=processes,
             threads_per_worker=1,
             memory_limit=0,
             dashboard_address=":0",
-            silence_logs=logging.CRITICAL,
+            silence_logs=logging.CRITICAL,  # of workers that are killed and started again
             env=environment(),
             preload=__name__,
         )
     except Exception as error:  # its kind differs between versions
         guard = 'something ends them, or a script has no `if __name__ == "__main__":` around its statements'
         raise ValueError(f"worker processes cannot start ({one_line(error)}): {guard}") from None
-    try:
-        with cluster, Client(cluster, set_as_default=False) as client:
-            yield client
-    finally:
-        logger.setLevel(level)
+    with cluster, Client(cluster, set_as_default=False) as client:
+        yield client
 
 
 # ---- threads of this process ----
@@ -204,8 +186,7 @@ def _run_cluster(work: Work, shared: Any, tasks: list[Any], client: Any) -> Iter
         raise ValueError(f"what tasks need cannot be pickled for the workers: {one_line(error)}") from None
     if not tasks:
         return
-    address, name = str(getattr(client.scheduler, "address", "the cluster")), f"layerjax-{uuid.uuid4().hex[:12]}"
-    submitted: dict[Any, int] = {}
+    address, submitted = str(getattr(client.scheduler, "address", "the cluster")), dict[Any, int]()
 
     def require_scheduler() -> None:
         if client.status != "running":
@@ -216,13 +197,12 @@ def _run_cluster(work: Work, shared: Any, tasks: list[Any], client: Any) -> Iter
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", message="Sending large graph")
             # a task, not scattered data: it is repeated if the workers that hold it are killed
-            sent = client.submit(bytes, payload, key=f"{name}-shared")
+            sent = client.submit(bytes, payload, pure=False)
             with client.as_current():
                 sent.result(timeout=TIMEOUT)
                 client.replicate([sent])  # a scheduler prefers workers that hold the data
             for index, task in enumerate(pickled):
-                future = client.submit(perform, sent, name, task, precision(), key=f"{name}-{index}", pure=False)
-                submitted[future] = index
+                submitted[client.submit(perform, sent, task, precision(), pure=False)] = index
         for future in as_completed(list(submitted), loop=client.loop):
             index = submitted.pop(future)
             try:
@@ -244,21 +224,23 @@ def _run_cluster(work: Work, shared: Any, tasks: list[Any], client: Any) -> Iter
             client.cancel(list(submitted), force=True)
 
 
-_jobs: dict[str, Any] = {}
-_jobs_lock = threading.Lock()
+def perform(payload: bytes, task: bytes, double: bool | None) -> Any:
+    """Execute a task in a worker, whatever the number of its threads."""
+    with _unpacking:
+        work, shared = unpacked(payload, double)
+    return attempt(work, shared, pickle.loads(task))
 
 
-def perform(payload: bytes, name: str, task: bytes, double: bool | None) -> Any:
-    """Execute a task in a worker, which is configured, and unpacks the common data, once for each run of this name."""
+_unpacking = threading.Lock()
+
+
+@lru_cache(maxsize=1)
+def unpacked(payload: bytes, double: bool | None) -> Any:
+    """What all tasks have in common, in a worker that is configured for them."""
     from distributed import get_worker
 
-    with _jobs_lock:
-        if name not in _jobs:
-            configure(double, int(get_worker().state.nthreads))
-            _jobs.clear()
-            _jobs[name] = pickle.loads(payload)
-        work, shared = _jobs[name]
-    return attempt(work, shared, pickle.loads(task))
+    configure(double, int(get_worker().state.nthreads))
+    return pickle.loads(payload)
 
 
 def precision() -> bool | None:

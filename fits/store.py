@@ -1,22 +1,17 @@
-"""Work that survives: what grows while it is computed, each finished piece a record of one SQLite file.
+"""Work that survives: starts, chains, candidates of a search, rows of a batch, each piece a record of one SQLite file.
 
-The starts of a fit, the steps of a chain, the candidates of a search and the rows of a batch are kept in this way. A
-record is written in a transaction, so that a process which is killed, or a disk which is full, costs the record that
-was being written and no other. SQLite's rollback journal is used, not its write-ahead log, which does not work on
-network file systems.
-
-One process writes, and holds a lock file beside the store while it does. Readers take a copy: they need no lock, change
-nothing, and hold up nobody. Every record carries a checksum, so that damage is reported instead of read. A fingerprint
-says whose work the store holds; the work of another problem is refused.
+A record is written in a transaction, so that a process which is killed, or a disk which is full, costs the record that
+was being written and no other; with SQLite's rollback journal, as its write-ahead log does not work on network file
+systems. One process writes, and holds a lock file beside the store while it does. Readers take a copy: they need no
+lock, change nothing, and hold up nobody. Every record carries a checksum, so that damage is reported instead of read. A
+fingerprint says whose work the store holds; the work of another problem is refused.
 
     with Store.open("chain.store", fingerprint(data=values, seed=0)) as store:
-        store.put("moves", {"kind": "stretch"})                        # one record a key, the last one counts
-        store.append("steps", {"coords": coords, "log_prob": log_prob, "random_state": state})
-    posterior = Store.read("chain.store")
-    steps = posterior.all("steps")                                     # in the order in which they were appended
+        store.put("moves", {"kind": "stretch"})                   # one record a key, the last one counts
+        store.append("steps", {"coords": coords, "log_prob": log_prob})
+    steps = Store.read("chain.store").all("steps")                # in the order in which they were appended
 
-A record is what JSON can hold (lists come back in place of tuples), with numpy arrays anywhere inside: of a chain, for
-instance, arrays (steps, walkers, P) and (steps, walkers) and the state of the random generator.
+A record is what JSON can hold (lists come back in place of tuples), with numpy arrays anywhere inside.
 """
 
 import base64
@@ -38,17 +33,10 @@ import numpy as np
 from fits._files import locked, named, require_there
 
 APPLICATION = 0x6C6A7802  # SQLite's application_id of a store; its last digits are the version of the layout
-_LAYOUT = """
-CREATE TABLE records (number INTEGER PRIMARY KEY, key TEXT, checksum INTEGER, text TEXT);
-"""
-_ARRAY, _WHOSE = "numpy", "fingerprint"
+_LAYOUT = "CREATE TABLE records (number INTEGER PRIMARY KEY, key TEXT, checksum INTEGER, text TEXT)"
+_ARRAY, _WHOSE, _DIGEST = "numpy", "fingerprint", "sha256:"
 _NO_ROOM = (sqlite3.SQLITE_FULL, sqlite3.SQLITE_IOERR_WRITE, sqlite3.SQLITE_IOERR_FSYNC, sqlite3.SQLITE_IOERR_TRUNCATE)
-_OF_SYSTEM = {
-    sqlite3.SQLITE_READONLY: errno.EACCES,
-    sqlite3.SQLITE_CANTOPEN: errno.EACCES,
-    sqlite3.SQLITE_PERM: errno.EACCES,
-    sqlite3.SQLITE_IOERR: errno.EIO,
-}
+_OF_SYSTEM = (sqlite3.SQLITE_READONLY, sqlite3.SQLITE_CANTOPEN, sqlite3.SQLITE_PERM, sqlite3.SQLITE_IOERR)
 _LONGEST = 60  # letters of a value that a fingerprint shows
 
 
@@ -88,7 +76,6 @@ class Store:
                 if fresh:
                     for one in (path, _journal(path)):
                         one.unlink(missing_ok=True)
-                _require_store(path)
                 # the lock file is what keeps others out: SQLite's own locks do not hold on every file system
                 place = f"{path.resolve().as_uri()}?nolock=1"
                 connection = sqlite3.connect(place, uri=True, check_same_thread=False)
@@ -111,7 +98,6 @@ class Store:
         path = Path(path)
         require_there(path)
         with _errors_of(path):
-            _require_store(path)
             return cls(path, _copied(path))
 
     def keys(self) -> list[str]:
@@ -220,9 +206,6 @@ def portable_repr(thing: Any) -> str:
     return re.sub(r" at 0x[0-9a-fA-F]+", "", repr(thing))
 
 
-_DIGEST = "sha256:"
-
-
 def _digest(part: Any) -> str:
     if part is None or isinstance(part, str | int | float):
         shown = str(part)
@@ -264,15 +247,6 @@ def _decoded(table: dict[str, Any]) -> Any:
 
 def _checksum(key: str, text: str) -> int:
     return zlib.crc32(f"{len(key)} {key} {text}".encode())
-
-
-def _require_store(path: Path) -> None:
-    """ValueError for a file that is something else."""
-    if path.is_file():
-        with open(path, "rb") as file:
-            begin = file.read(16)
-        if begin not in (b"", b"SQLite format 3\0"):
-            raise ValueError(damaged(path))
 
 
 def _copied(path: Path) -> sqlite3.Connection:
@@ -317,7 +291,7 @@ def _errors_of(path: Path) -> Iterator[None]:
         if code == sqlite3.SQLITE_READONLY_DBMOVED:
             raise OSError(errno.ENOENT, "Removed, or replaced, while it was written", str(path)) from None
         if code & 0xFF in _OF_SYSTEM:
-            raise OSError(_OF_SYSTEM[code & 0xFF], str(error).capitalize(), str(path)) from None
+            raise OSError(errno.EIO, str(error).capitalize(), str(path)) from None
         raise ValueError(damaged(path)) from None
     except (UnicodeError, TypeError, LookupError):  # what stands there is of another kind
         raise ValueError(damaged(path)) from None

@@ -8,16 +8,15 @@ predict as well as one that lacks one.
 """
 
 import math
-import re
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
-
-import numpy as np
+from urllib.parse import quote
 
 import layerjax as lj
 from fits._files import given_path
@@ -25,8 +24,10 @@ from fits.data.measurements import TO_HAVE_THEM, Measurements
 from fits.optimise.fit import fit as run_fit
 from fits.optimise.options import DEFAULT, FitOptions
 from fits.optimise.result import Fit
+from fits.prediction.compare import ComparedFit, Comparison
 from fits.prediction.cross_validation import CrossValidation, ModelScore, out_of_sample, rank_models
 from fits.prediction.importance import Evidence
+from fits.prediction.options import ComparisonOptions
 from fits.problem.compilation import cores, make_room
 from fits.problem.instrument import Instrument
 from fits.problem.model import Transport
@@ -37,6 +38,7 @@ from fits.problem.stack_file import check_keys, read_tables, require_table, stac
 from fits.progress import Progress, given_progress
 from fits.reports.pages import Table
 from fits.reports.results import load_fit, save_fit
+from fits.reports.tables import comparison_table
 from fits.reports.verdicts import listed, verdict
 from fits.store import Store, fingerprint, make_directory
 from layerjax._checks import require_count, require_kind, require_number, require_seed
@@ -49,18 +51,21 @@ TOGETHER = 8  # structures at a time, at most: as many programs as a process can
 Structure = tuple[str, ...]
 """Names of layers from top to bottom, and of the base."""
 
-Checked = tuple[Fit, CrossValidation, Evidence]
-"""A fit at full resolution, its cross-validation and its evidence."""
+
+class Checked(NamedTuple):
+    """The fit of a structure as `fits.fit` fits it, its cross-validation and its evidence."""
+
+    fit: Fit
+    held_out: CrossValidation
+    evidence: Evidence
+
 
 # ---- what stacks are made of ----
 
 
 @dataclass(frozen=True)
 class Library:
-    """Layers and bases by name; a base is a surface, or a stack of its own that lets no light pass.
-
-    Names are letters, digits, blanks, hyphens and underscores, and differ by more than case, blanks and hyphens.
-    """
+    """Layers and bases by name, which differ by more than case; a base is a stack that lets no light pass."""
 
     layers: Mapping[str, lj.Interface | lj.Medium]
     bases: Mapping[str, lj.Stack]
@@ -69,13 +74,9 @@ class Library:
         for kind in ("bases", "layers"):
             if not getattr(self, kind):
                 raise ValueError(f"library: it has no {kind}")
-        files: dict[str, str] = {}
-        for name in (*self.bases, *self.layers):
-            if not re.fullmatch(r"\w[\w -]*", name):
-                raise ValueError(f"library: {name!r} is no name; it must be letters, digits, blanks, - and _")
-            if (key := name.replace(" ", "-").casefold()) in files:
-                raise ValueError(f"library: {files[key]!r} and {name!r} are one name as files; they must differ")
-            files[key] = name
+        names = [name.casefold() for name in (*self.layers, *self.bases)]
+        if same := {name for name in names if names.count(name) > 1}:
+            raise ValueError(f"library: {min(same)!r} is there twice; names must differ by more than case")
 
     def stack(self, structure: Structure) -> lj.Stack:
         """The stack with these layers over this base."""
@@ -180,14 +181,12 @@ class Candidate:
 
     Attributes:
         structure: its layers from the top, and its base.
-        parameters: how many are free in its fit.
         bic: of the fit with independent noise, less the lowest of all.
         fit: at full resolution if it was cross-validated, else the one with independent noise.
         model_score: predictive score and evidence; None if it was not cross-validated.
     """
 
     structure: Structure
-    parameters: int
     bic: float
     fit: Fit
     model_score: ModelScore | None
@@ -196,6 +195,11 @@ class Candidate:
     def name(self) -> str:
         """The structure as words."""
         return named(self.structure)
+
+    @property
+    def parameters(self) -> int:
+        """How many are free in its fit."""
+        return len(self.fit.vector)
 
 
 @dataclass(frozen=True, eq=False)
@@ -270,42 +274,39 @@ def search(
     settings = {"transport": transport, "noise": noise or Noise(), "scale": scale, "instrument": instrument}
     store: Any = nullcontext()
     if directory is not None:
-        directory, used = given_path("directory", directory), data.used()
+        path, used = make_directory(given_path("directory", directory), STORE), data.used()
         # how far it goes is no part of whose search it is: one may go on where another has ended
         starting = {"starts": options.starts, "seed": seed, "fit": options.fit}
         numbers = [used.wi, used.wo, used.values, used.sigma]
-        store = Store.open(
-            make_directory(directory, STORE), fingerprint(data=numbers, library=library, **settings, **starting)
-        )
+        store = Store.open(path, fingerprint(data=numbers, library=library, **settings, **starting))
     with store as opened:
         work = _Work(data, library, settings, options, seed, opened, given_progress(progress))
-        coarse: dict[Structure, Fit] = {}
-        full: dict[Structure, Checked] = {}
+        fits: dict[Structure, Fit] = {}
+        bic: dict[Structure, float] = {}
+        checked: dict[Structure, Checked] = {}
+        scores: dict[Structure, ModelScore] = {}
         level: list[Structure] = [(base,) for base in library.bases]
         while level:
-            leader, lowest = _ranked(full)[:1], min(map(_bic, coarse.values()), default=math.inf)
+            leader, lowest = list(scores)[:1], min(bic.values(), default=math.inf)
             # every structure of the level with independent noise, at a coarse resolution
-            coarse |= work.in_parallel(f"{len(level[0]) - 1} layers", work.fit_coarsely, level)
+            fits |= work.in_parallel(f"{len(level[0]) - 1} layers", partial(work.fit, coarse=True), level)
+            bic |= {one: ComparedFit(named(one), fits[one]).bic for one in level}
             # those of the lowest BIC as `fits.fit` fits them, cross-validated
-            best_of_level = sorted(level, key=lambda one: _bic(coarse[one]))[: options.cross_validated]
-            full |= work.in_parallel("cross-validation", work.cross_validate, best_of_level)
+            best_of_level = sorted(level, key=bic.__getitem__)[: options.cross_validated]
+            checked |= work.in_parallel("cross-validation", work.cross_validate, best_of_level)
+            scores = _scores(checked)
             # a level that neither predicts better nor lowers the BIC clearly is the last
-            ahead = not leader or _scores(full)[named(leader[0])].clear_diff > 0.0
-            if not ahead and not min(map(_bic, coarse.values())) < lowest - options.bic_gain:
+            ahead = not leader or scores[leader[0]].clear_diff > 0.0
+            if not ahead and not min(bic.values()) < lowest - options.bic_gain:
                 break
-            by_bic = sorted(coarse, key=lambda one: _bic(coarse[one]))
-            grown = _neighbours(library, dict.fromkeys(_ranked(full)[:1] + by_bic[: options.beam]), options.layers)
-            level = [one for one in grown if one not in coarse]
+            parents = dict.fromkeys([*list(scores)[:1], *sorted(bic, key=bic.__getitem__)[: options.beam]])
+            level = [one for one in _neighbours(library, parents, options.layers) if one not in bic]
         work.progress("cross-validation", 1, 1, "")
     # all that was fitted, ranked
-    scores, bic = _scores(full), {structure: _bic(fit) for structure, fit in coarse.items()}
-    order = [*_ranked(full), *sorted((one for one in coarse if one not in full), key=bic.__getitem__)]
-    candidates = []
-    for structure in order:
-        fit = full[structure][0] if structure in full else coarse[structure]
-        above = bic[structure] - min(bic.values())
-        candidates.append(Candidate(structure, len(fit.vector), above, fit, scores.get(named(structure))))
-    return Search(tuple(candidates), options)
+    fits |= {one: found.fit for one, found in checked.items()}
+    order = [*scores, *sorted((one for one in bic if one not in scores), key=bic.__getitem__)]
+    lowest = min(bic.values())
+    return Search(tuple(Candidate(one, bic[one] - lowest, fits[one], scores.get(one)) for one in order), options)
 
 
 class _Work(NamedTuple):
@@ -319,38 +320,33 @@ class _Work(NamedTuple):
     store: Store | None
     progress: Progress
 
-    def fit_coarsely(self, structure: Structure) -> Fit:
-        """The fit with independent noise at a coarse resolution."""
-        problem = Problem(self.library.stack(structure), self.data, **self.settings)
-        problem = replace(problem, noise=replace(problem.noise, discrepancy=False))
-        return self._load_or_fit(structure, "", problem, screen=True)
-
-    def cross_validate(self, structure: Structure) -> Checked:
-        """The fit as `fits.fit` fits it, with each incidence held out, and its evidence."""
-        problem = Problem(self.library.stack(structure), self.data, **self.settings)
-        fit, key = self._load_or_fit(structure, "+full", problem), named(structure)
-        record = None if self.store is None else self.store.get(key)
-        if record is not None:
-            checked = record["cross-validation"]
-            checked |= {"groups": tuple(checked["groups"]), "rows": tuple(checked["rows"])}
-            return fit, CrossValidation(**checked), Evidence(**record["evidence"])
-        checked, evidence = out_of_sample(fit)
-        if self.store is not None:
-            self.store.put(key, {"cross-validation": vars(checked), "evidence": vars(evidence)})
-        return fit, checked, evidence
-
-    def _load_or_fit(self, structure: Structure, kind: str, problem: Problem, screen: bool = False) -> Fit:
-        """The fit of a structure, from its result directory if it is there."""
+    def fit(self, structure: Structure, coarse: bool = False) -> Fit:
+        """As `fits.fit` fits it, or with independent noise at a coarse resolution; kept in a result directory."""
         path = None
         if self.store is not None:
-            path = self.store.path.with_name("+".join(name.replace(" ", "-") for name in structure) + kind)
+            path = self.store.path.with_name("+".join(quote(name, "") for name in structure) + "+full" * (not coarse))
             if path.is_dir():
                 return load_fit(path)
+        problem = Problem(self.library.stack(structure), self.data, **self.settings)
+        if coarse:
+            problem = replace(problem, noise=replace(problem.noise, discrepancy=False))
         options = self.options
-        fit = run_fit(problem, starts=options.starts, seed=self.seed, options=options.fit, screen=screen)
+        fit = run_fit(problem, starts=options.starts, seed=self.seed, options=options.fit, screen=coarse)
         if path is not None:
             save_fit(fit, path)
         return fit
+
+    def cross_validate(self, structure: Structure) -> Checked:
+        """The fit, with each incidence held out, and its evidence; both are kept in the store."""
+        fit, key = self.fit(structure), named(structure)
+        if self.store is not None and (record := self.store.get(key)) is not None:
+            checked = record["cross-validation"]
+            checked |= {"groups": tuple(checked["groups"]), "rows": tuple(checked["rows"])}
+            return Checked(fit, CrossValidation(**checked), Evidence(**record["evidence"]))
+        held_out, evidence = out_of_sample(fit)
+        if self.store is not None:
+            self.store.put(key, {"cross-validation": vars(held_out), "evidence": vars(evidence)})
+        return Checked(fit, held_out, evidence)
 
     def in_parallel(
         self, stage: str, call: Callable[[Structure], Any], structures: list[Structure]
@@ -380,44 +376,23 @@ def _neighbours(library: Library, structures: Iterable[Structure], most: int) ->
     return list(dict.fromkeys(one for one in neighbours if all(a != b for a, b in pairwise(one))))
 
 
-def _bic(fit: Fit) -> float:
-    """Bayesian information criterion of a fit with independent noise."""
-    return len(fit.vector) * float(np.log(fit.problem.count)) - 2.0 * fit.log_likelihood
-
-
-def _ranked(full: Mapping[Structure, Checked]) -> list[Structure]:
-    """What was cross-validated, best first."""
-    return sorted(full, key=lambda one: -full[one][1].elpd)
-
-
-def _scores(full: Mapping[Structure, Checked]) -> dict[str, ModelScore]:
-    """Scores side by side by name, best first."""
-    ranked = _ranked(full)
-    return rank_models({named(one): full[one][1] for one in ranked}, {named(one): full[one][2] for one in ranked})
+def _scores(checked: Mapping[Structure, Checked]) -> dict[Structure, ModelScore]:
+    """Scores of structures side by side, best first."""
+    ranked = sorted(checked, key=lambda one: -checked[one].held_out.elpd)
+    held_out = {named(one): checked[one].held_out for one in ranked}
+    evidences = {named(one): checked[one].evidence for one in ranked}
+    return dict(zip(ranked, rank_models(held_out, evidences).values(), strict=True))
 
 
 # ---- what it found ----
 
 
-def search_table(search: Search, most: int | None = None) -> Table:
-    """A row for each structure, best first."""
-    rows = []
-    for one in search.candidates[:most]:
-        score, without = one.model_score, one.fit.without_discrepancy
-        count, ratio, cells = one.parameters, one.fit.reduced_chi_square, ("", "", "", "")
-        if without is not None:  # of the stack alone
-            count, ratio = len(without.values), without.chi_square / max(without.degrees_of_freedom, 1)
-        if score is not None:
-            difference = f"{score.elpd_diff:.1f} ± {score.dse:.1f}"
-            cells = (f"{score.elpd:.1f}", difference, f"{score.weight:.2f}", f"{score.model_probability:.2g}")
-        rows.append((one.name, str(count), f"{ratio:.3g}", f"{one.bic:.1f}", *cells))
-    hidden = len(search.candidates) - len(rows)
-    note = (
-        "First the cross-validated models, by elpd (sum of log predictive densities of held-out data); then the "
-        "others, by BIC with independent noise." + (f" There are {hidden} more." if hidden else "")
-    )
-    heads = ("from the top", "parameters", "chi2/dof", "BIC - best", "elpd", "elpd_diff ± dse", "weight", "probability")
-    return Table("Stacks", heads, tuple(rows), note)
+def search_table(search: Search) -> Table:
+    """The cross-validated stacks side by side, as `fits.compare` has them."""
+    rows = [ComparedFit(one.name, one.fit, one.model_score) for one in search.candidates if one.model_score is not None]
+    others = len(search.candidates) - len(rows)
+    notes = (f"{others} others were fitted with independent noise only",) if others else ()
+    return comparison_table(Comparison(tuple(rows), "elpd", "", notes, ComparisonOptions()))
 
 
 def search_sentences(search: Search) -> list[str]:

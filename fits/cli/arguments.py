@@ -44,20 +44,13 @@ def _several(what: str, metavar: str, **settings: Any) -> Settings:
     return _one(what, metavar, nargs="+", **{"default": ()} | settings)
 
 
-def _numbers(what: str, metavar: str, number: Callable[[str], Any], **settings: Any) -> Settings:
-    """Those of several numbers, with commas or spaces between them."""
+def _numbers(what: str, metavar: str, number: Callable[[str], Any]) -> Settings:
+    """Those of several numbers, with commas between them."""
 
     def read(words: str) -> list[Any]:
         return [number(word) for word in words.split(",")]
 
-    return _several(what, metavar, type=read, action=_Joined, **settings)
-
-
-class _Joined(argparse.Action):
-    """Keeps lists of numbers as one."""
-
-    def __call__(self, parser: Any, namespace: Any, values: Any, option_string: Any = None) -> None:
-        setattr(namespace, self.dest, [number for some in values for number in some])
+    return _one(what, metavar, type=read)
 
 
 def _flag(what: str) -> Settings:
@@ -71,8 +64,8 @@ def _out(metavar: str, what: str = "file to write", required: bool = True) -> Se
 DATA = _one("measurements: csv, MERL .binary, .bsdf and others, see docs/formats.md", "DATA")
 RESULT = _one("result directory of `layerjax fit`", "DIR")
 MATERIAL = _one("result directory, stack (free parameters at their start), or material of the gallery", "DIR|TOML|NAME")
-INCIDENCE = _numbers("polar angles of the light", "DEG", polar)
-AZIMUTH = _numbers("planes; 0 is that of incidence (default)", "DEG", azimuth)
+INCIDENCE = _numbers("polar angles of the light", "DEG,...", polar)
+AZIMUTH = _numbers("planes; 0 is that of incidence (default)", "DEG,...", azimuth)
 READ_HELP = (
     "options of the reader: format=merl; quantity=brdf, brdf_cos or reflectance_factor; bins=5000 or all, strata=flux "
     "(MERL, RGL); wavelengths=600,620 in nm, corrected=yes or no (.rxt); default: as the file says"
@@ -255,9 +248,7 @@ COMMANDS = {
             "material": MATERIAL,
             "--to": _one("rgl: Mitsuba's and pbrt's tensor file; openpbr: MaterialX", choices=EXPORTS, required=True),
             "--out": _out("FILE"),
-            "--wavelengths": _numbers(
-                "of the channels, for a spectral rgl file", "NM", _number(float, 1.0, 1e9), default=None
-            ),
+            "--wavelengths": _numbers("of the channels, for a spectral rgl file", "NM,...", _number(float, 1.0, 1e9)),
         },
         "--force",
     ),

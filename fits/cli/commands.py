@@ -6,14 +6,14 @@ Inputs are checked, and outputs refused, before any work begins. Numbers go to s
 import warnings
 from argparse import Namespace
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from fits._files import write_bytes, write_text
-from fits.cli.input_output import DONE, DOUBTFUL, hint, read_options, refuse_alone, require_free_place, show, use_jax
-from fits.cli.maps import fit_map, is_map, report_map
+from fits.cli.input_output import DONE, DOUBTFUL, hint, read_options, refuse_alone, require_place, show, use_jax
 from fits.data.geometry import slices
 from fits.data.measurements import Measurements
 from fits.data.totals import Totals
@@ -23,6 +23,8 @@ if TYPE_CHECKING:
     from fits.optimise.result import Fit
     from fits.sampling.posterior import Posterior
     from layerjax import Mixture, Stack
+
+RESUME = "keeps what was fitted; the same command resumes it"
 
 # ---- a fit and what follows from it ----
 
@@ -95,7 +97,7 @@ def predict(arguments: Namespace) -> int:
     if not scored and out is None:
         raise ValueError("predict --incidence needs --out FILE")
     refuse_alone(arguments, ("azimuth",) if scored else ("select", "read"), "incidence" if scored else "score")
-    require_free_place(out, arguments.force, ".csv", "predictions")
+    require_place(out, arguments.force, ".csv", "predictions")
     use_jax()
     from fits.prediction.predict import predict as run_prediction
     from fits.reports import tables
@@ -119,14 +121,14 @@ def predict(arguments: Namespace) -> int:
 
 def report(arguments: Namespace) -> int:
     """Write the report of a saved fit again, beside that of others if given; or that of a fitted map."""
-    if is_map(arguments.directory) or Path(arguments.directory).suffix == ".zarr":
-        return report_map(arguments)
+    directory = Path(arguments.directory)
+    if (directory / "zarr.json").is_file() or directory.suffix == ".zarr":
+        return _report_map(directory, arguments)
     use_jax()
     from fits.reports import results
     from fits.reports.html import FitReport
 
-    directory = Path(arguments.directory)
-    require_free_place(arguments.out, arguments.force)
+    require_place(arguments.out, arguments.force)
     result, posterior = results.load_fit(directory), results.load_posterior(directory)
     others, held_out = _candidates(arguments.compare), results.load_held_out(directory)
     out = arguments.out or directory / results.REPORT
@@ -162,7 +164,63 @@ def _result(directory: Path) -> "Fit | Posterior":
     return posterior if posterior is not None and verdicts.reportable(posterior) else results.load_fit(directory)
 
 
-# ---- many stacks, many files ----
+# ---- maps, many stacks, many files ----
+
+
+def fit_map(arguments: Namespace) -> int:
+    """Fit a stack to every texel of a map, or resume it, and print what was found."""
+    if Path(arguments.out).suffix != ".zarr":
+        raise ValueError(f"{arguments.out}: a fitted map can be written as .zarr only")
+    kind, scale = arguments.spatial_prior, arguments.spatial_scale
+    if (kind is None) != (scale is None):
+        raise ValueError("--spatial-prior needs --spatial-scale, such as 0.05, and the scale the prior")
+    use_jax()
+    from fits.maps import report
+    from fits.maps.fit_map import fit_map as run_fit
+    from fits.maps.options import MapOptions, SpatialPrior
+    from fits.problem.stack_file import read_problem
+
+    given = read_problem(arguments.stack)
+    noise = given.noise if arguments.noise is None else replace(given.noise, relative=arguments.noise)
+    settings: dict[str, Any] = {name: getattr(given, name) for name in ("scale", "objective", "instrument")}
+    for name in ("starts", "seed", "pilot_texels", "chunk_size", "processes", "force"):
+        settings[name] = getattr(arguments, name)
+    settings["emulator"] = {"auto": None, "always": True, "never": False}[arguments.emulator]
+    settings["spatial_prior"] = None if kind is None else SpatialPrior(kind, scale)
+    with show_progress() as progress, hint(f"{arguments.out} {RESUME}"):
+        map = run_fit(
+            given.stack,
+            arguments.geometry,
+            arguments.data,
+            arguments.out,
+            noise=noise,
+            client=arguments.scheduler,
+            transport=given.transport,
+            sigma=arguments.sigma,
+            mask=arguments.mask,
+            options=MapOptions(**settings, progress=progress),
+        )
+    found = report.summarise(map)
+    where = f"Store: {arguments.out}. For the report: layerjax report {arguments.out}"
+    show(report.quartile_table(found, map), report.common_table(map), *report.verdict(found, map)[0], where)
+    whole = found.done == found.texels and found.fitted > 0
+    return DONE if whole and found.converged >= map.option("converged_share") else DOUBTFUL
+
+
+def _report_map(store: Path, arguments: Namespace) -> int:
+    """Write the report of a map, beside its store if no other place is given, and print its verdict."""
+    if arguments.compare:
+        raise ValueError(f"--compare: {store} is a map, which is not compared with others")
+    out = arguments.out or (store if store.name else store.resolve()).with_suffix(".html")
+    require_place(out, arguments.force)
+    from fits.maps import report
+    from fits.maps.store import open_map
+
+    map = open_map(store)
+    with show_progress() as progress:
+        found = report.report(map, out, arguments.force, progress)
+    show(*report.verdict(found, map)[0], f"Report: {out}")
+    return DONE
 
 
 def search(arguments: Namespace) -> int:
@@ -189,11 +247,8 @@ def search(arguments: Namespace) -> int:
     }
     with show_progress() as progress, hint(f"{directory} {RESUME}"):
         found = structure_search.search(data, **settings, directory=directory, progress=progress)
-    show(structure_search.search_table(found, 20), *structure_search.search_sentences(found), f"Fits: {directory}")
+    show(structure_search.search_table(found), *structure_search.search_sentences(found), f"Fits: {directory}")
     return DONE
-
-
-RESUME = "keeps what was fitted; the same command resumes it"
 
 
 def fit_many(arguments: Namespace) -> int:
@@ -228,7 +283,7 @@ def info(arguments: Namespace) -> int:
     from fits.reports.tables import Table
 
     out, force = arguments.out or f"{Path(arguments.data).stem}.png", arguments.force
-    require_free_place(arguments.out, force, ".png", "pictures")
+    require_place(arguments.out, force, ".png", "pictures")
     data = read_options(arguments).read(arguments.data)
     show(Table(data.source.path, ("", ""), source_rows(data)), data_table(data), *data_statements(data))
     if Path(out).exists() and not force:
@@ -242,7 +297,7 @@ def info(arguments: Namespace) -> int:
 
 def convert(arguments: Namespace) -> int:
     """Read any supported format and write csv."""
-    require_free_place(arguments.out, arguments.force, ".csv", "measurements")
+    require_place(arguments.out, arguments.force, ".csv", "measurements")
     return _write_measurements(read_options(arguments).read(arguments.data), arguments)
 
 
@@ -265,7 +320,7 @@ def _write_measurements(data: Measurements, arguments: Namespace) -> int:
 
 def simulate(arguments: Namespace) -> int:
     """Write simulated measurements of a stack; noise, scale and instrument of its file are not simulated."""
-    require_free_place(arguments.out, arguments.force, ".csv", "measurements")
+    require_place(arguments.out, arguments.force, ".csv", "measurements")
     use_jax()
     from fits.problem.parameters import at_start
     from fits.problem.simulate import simulate as run_simulation
@@ -280,7 +335,7 @@ def simulate(arguments: Namespace) -> int:
 
 def render(arguments: Namespace) -> int:
     """Draw a material of the gallery, or of a file, or the best of a saved fit."""
-    require_free_place(arguments.out, arguments.force, ".png", "pictures")
+    require_place(arguments.out, arguments.force, ".png", "pictures")
     use_jax()
     from fits.optimise.result import Fit
     from fits.reports.plots.data import as_png
@@ -302,7 +357,7 @@ def render(arguments: Namespace) -> int:
 
 def export(arguments: Namespace) -> int:
     """Write a material, or the best of a saved fit, for renderers or for optical design."""
-    require_free_place(arguments.out, arguments.force)
+    require_place(arguments.out, arguments.force)
     use_jax()
     from fits.exports.export import export as run_export
 

@@ -8,6 +8,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from fits._files import require_free_place
+
 if TYPE_CHECKING:
     from fits.data.reading import ReadOptions
     from fits.reports.tables import Table
@@ -48,27 +50,23 @@ def refuse_alone(arguments: Namespace, names: tuple[str, ...], needed: str) -> N
             raise ValueError(f"--{name.replace('_', '-')} is given without --{needed}")
 
 
-def require_free_place(path: str | Path | None, force: bool, ending: str = "", what: str = "") -> None:
-    """ValueError unless a file, of this ending for this content, can be written there, and none would be overwritten
-    without `force`."""
-    if path is None:
-        return
-    if ending and Path(path).suffix.lower() != ending:
+def require_place(path: str | Path | None, force: bool, ending: str = "", what: str = "") -> None:
+    """ValueError unless a file, if any, of this ending for this content can be written there, see `force`."""
+    if path is not None and not str(path).lower().endswith(ending):
         raise ValueError(f"{path}: {what} can be written as {ending} only")
-    if Path(path).is_dir():
-        raise ValueError(f"{path}: is a directory, must be a file")
-    if not Path(path).resolve().parent.is_dir():
-        raise ValueError(f"{path}: there is no directory {Path(path).parent}")
-    if Path(path).exists() and not force:
-        raise ValueError(f"{path}: the file exists already (--force overwrites it)")
+    if path is not None:
+        require_free_place(Path(path), force)
 
 
 def show(*what: "Table | str") -> None:
-    """Prints tables and sentences."""
+    """Prints sentences, and tables that have a row."""
     from fits.reports.tables import print_table
 
     for one in what:
-        print(one) if isinstance(one, str) else print_table(one, sys.stdout)
+        if isinstance(one, str):
+            print(one)
+        elif one.rows:
+            print_table(one, sys.stdout)
 
 
 @contextmanager

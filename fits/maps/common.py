@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fits.maps.options import MapOptions
-from fits.maps.search import fit_first, search, starts_at
+from fits.maps.search import fit_first, fit_pilot_texels
 from fits.maps.texels import Fits, Integers, Texels, fit_texels, held_by_bounds, widths, with_own_directions
 from fits.optimise.multi_start import start_points
 from fits.optimise.uncertainty import LARGEST_ERROR, UNKNOWN_BEYOND
@@ -69,8 +69,7 @@ def fit_common(problem: Problem, pilot: Texels, options: MapOptions) -> dict[str
     information = np.sum(np.square(first.root), axis=1)[:, places]
     at = np.average(first.unit[:, places], axis=0, weights=information + np.finfo(float).tiny)
     held = held_at(at)
-    starts = starts_at(held, fit_first(held, points[:, own], pilot, size).distinct(), pilot.wi is not None, size)
-    fits = search(held, starts, pilot, size, options).fits
+    fits = fit_pilot_texels(held, points[:, own], pilot, options)
     pilot, units = pilot.rows(fits.finite), fits.unit[fits.finite]
 
     def joint_at(at: Floats, units: Floats) -> tuple[float, Floats, Floats]:

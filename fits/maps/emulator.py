@@ -33,9 +33,6 @@ Truths = NDArray[np.bool_]
 CORNERS, LINE_NODES, CHECKS, ROUNDS = 12, 33, 64, 3
 """Lines through the box beside its middle, nodes on each, points that are checked, and emulators tried."""
 
-OFFSET = 1.0
-"""Multiple of a datum's mean over the box that is added before the logarithm, whose series is then shortest."""
-
 LOGARITHMIC_ABOVE = 5.0  # ratio of the bounds of a parameter from which its logarithm is the coordinate
 
 MORE = 1.25
@@ -142,11 +139,10 @@ class _Space:
             vectors[:, of_channel] = np.clip(physical, self.problem.low[of_channel], self.problem.high[of_channel])
         return vectors
 
-    def values(self, points: Floats) -> tuple[Floats, Floats]:
+    def values(self, points: Floats) -> list[Floats]:
         """BSDF without the common scale at points (G, D), (G, N, C) in 1/sr, and standard deviations of the data."""
         share = max(1, min(SHARE, -(-len(points) // cores())))
-        values, sigma = in_shares(lambda rows: self.problem.call(_unscaled, rows), self.vectors(points), share)
-        return values, sigma
+        return in_shares(lambda rows: self.problem.call(_unscaled, rows), self.vectors(points), share)
 
 
 def emulate(problem: Problem, options: MapOptions = DEFAULT) -> tuple[Emulator | None, str]:
@@ -171,8 +167,8 @@ def emulate(problem: Problem, options: MapOptions = DEFAULT) -> tuple[Emulator |
         # the largest error at points that were not solved for it, in standard deviations of the data
         points = 2.0 * qmc.Sobol(len(low), rng=np.random.default_rng(1)).random(CHECKS) - 1.0
         values, sigma = space.values(points)
-        ready = problem.with_model(with_emulator(problem.model, emulator))
-        error = float(np.max(np.abs(np.asarray(ready.call(_emulated, space.vectors(points))) - values) / sigma))
+        found = np.asarray(jax.vmap(emulator.values)(jnp.asarray(space.vectors(points))))
+        error = float(np.max(np.abs(found - values) / sigma))
         if error <= options.emulator_error:
             count = len(emulator.orders)
             return emulator, f"an emulator of {count:,} terms from {solves:,} solutions, error {error:.2g} sd"
@@ -211,7 +207,7 @@ def _needed_terms(space: _Space, tolerance: float) -> tuple[tuple[int, ...], Flo
     for coordinate in range(count):
         lines[coordinate, ..., coordinate] = nodes
     values, sigma = (part.reshape(*lines.shape[:3], *part.shape[1:]) for part in space.values(lines.reshape(-1, count)))
-    offset = OFFSET * np.mean(np.abs(values), axis=(0, 1, 2))
+    offset = np.mean(np.abs(values), axis=(0, 1, 2))  # with a datum's mean, series of the logarithm are shortest
     if np.any(values + offset <= 0.0):
         return (LINE_NODES,), offset
     series = np.abs(_series(np.log(values + offset), 2))
@@ -235,10 +231,9 @@ def _series(values: Floats, axis: int) -> Floats:
 
 
 def _make(space: _Space, terms: tuple[int, ...], offset: Floats, tolerance: float) -> Emulator:
-    def grid(axes: list[Any]) -> NDArray[Any]:
-        return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(terms))
-
-    values, sigma = space.values(grid([_nodes(count) for count in terms]))
+    orders = np.indices(terms).reshape(len(terms), -1).T
+    nodes = np.stack([_nodes(count)[order] for count, order in zip(terms, orders.T, strict=True)], axis=1)
+    values, sigma = space.values(nodes)
     smallest = np.max(np.abs(values), axis=0) * np.finfo(float).tiny + np.finfo(float).tiny
     logarithms = np.log(np.maximum(values + offset, smallest))  # (G, N, C)
     mean = logarithms.mean(axis=0)
@@ -255,7 +250,7 @@ def _make(space: _Space, terms: tuple[int, ...], offset: Floats, tolerance: floa
     order = np.argsort(sizes)
     kept = np.ones(len(sizes), bool)
     kept[order[np.sqrt(np.cumsum(sizes[order] ** 2)) <= 0.2 * tolerance]] = False
-    arrays = {"orders": grid([np.arange(count) for count in terms])[kept], "coefficients": series[:, kept]}
+    arrays: dict[str, Any] = {"orders": orders[kept], "coefficients": series[:, kept]}
     arrays |= {"directions": directions, "mean": mean.T, "offset": offset.T, "logarithmic": space.logarithmic}
     return Emulator.of(arrays | {"low": space.low, "high": space.high, "places": space.places})
 
@@ -275,7 +270,3 @@ def _unscaled(model: Model, vectors: Array) -> tuple[Array, Array]:
         return predicted / scale, model.sigma_at(vector, predicted) / scale
 
     return jax.lax.map(one, vectors)
-
-
-def _emulated(model: Any, vectors: Array) -> Array:
-    return jax.vmap(model.emulator.values)(vectors)

@@ -19,7 +19,7 @@ import layerjax as lj
 from fits._files import given_path, locked
 from fits.data.geometry import direction
 from fits.engines import Failure, connected, run
-from fits.maps.inputs import Block, MapData, block_words, map_data
+from fits.maps.inputs import Block, block_words, map_data
 from fits.maps.options import DEFAULT, VERDICTS, MapOptions
 from fits.maps.pilot import Job, fit_pilot, job_of, make_prototype, pilot_texels
 from fits.maps.search import reduced_chi_square, search
@@ -79,60 +79,56 @@ def fit_map(
     require_kind("noise", noise, Noise, None)
     if options.instrument is not None and data.geometry is None:
         raise ValueError("instrument is given, but every texel has directions of its own; there can be no instrument")
-    if noise is not None and not noise.use_sigma:
+    noise = noise or Noise()
+    if not noise.use_sigma:
         data = replace(data, sigma=None)
     size = min(options.chunk_size, max(MapOptions.chunk_size, math.prod(data.shape)))  # no program for a million texels
-    path = given_path("out", out)
+    options, path = replace(options, chunk_size=size), given_path("out", out)
     if not path.resolve().parent.is_dir():
         raise ValueError(f"{path}: there is no directory {path.parent}")
     with connected(client, options.processes) as connection, locked(Path(f"{path}.lock"), str(path)):
-        return _fit(path, data, stack, noise, transport, replace(options, chunk_size=size), connection)
+        # 1. whose map it is
+        identity = _identity(stack, noise, transport, data.samples, options) | {"measurements": data.fingerprint()}
+        store = resume(path, identity, options.force)
 
+        # 2. the pilot: what all chunks have in common
+        if options.instrument is not None:  # the floor of a map's noise stands in one place
+            noise = with_floor(noise, options.instrument)
+            options = replace(options, instrument=replace(options.instrument, floor=None))
+        texels = pilot_texels(data, options.pilot_texels)
+        problem = make_prototype(texels, data, stack, noise, transport, options)
+        if store is None:
+            arrays, about = fit_pilot(problem, texels, data.shape, options)
+            names = [name for name in problem.names if name not in about["common"]]
+            about |= {
+                "names": names,
+                "units": {name: problem.units[name] for name in names},
+                "shape": data.shape,
+                "chunk": tile(data.shape, options.chunk_size),
+                "samples": data.samples,
+                "channels": list(problem.data.channels),
+                "options": options.numbers(),
+                "stack": repr(stack),
+                "noise_assumed": problem.objective == "likelihood" and is_assumed(noise, problem.data),
+                "version": lj.__version__,
+                "fingerprints": identity,
+            }
+            store = create(path, about, arrays)
 
-def _fit(
-    path: Path, data: MapData, stack: Any, noise: Noise | None, transport: Any, options: MapOptions, client: Any
-) -> FittedMap:
-    # 1. whose map it is
-    identity = _identity(stack, noise, transport, data.samples, options) | {"measurements": data.fingerprint()}
-    store = resume(path, identity, options.force)
+        # 3. all chunks
+        job = job_of(store, problem, options, data)
+        if failures := _fit_chunks(store, job, connection, options):
+            more = f"; and {len(failures) - NAMED} more" if len(failures) > NAMED else ""
+            words = f"{'; '.join(failures[:NAMED])}{more}"
+            raise ValueError(f"{path}: {words}; all other chunks are done, and another run does these")
 
-    # 2. the pilot: what all chunks have in common
-    if options.instrument is not None:  # the floor of a map's noise stands in one place
-        noise = with_floor(noise or Noise(), options.instrument)
-        options = replace(options, instrument=replace(options.instrument, floor=None))
-    texels = pilot_texels(data, options.pilot_texels)
-    problem = make_prototype(texels, data, stack, noise, transport, options)
-    if store is None:
-        arrays, about = fit_pilot(problem, texels, data.shape, options)
-        names = [name for name in problem.names if name not in about["common"]]
-        about |= {
-            "names": names,
-            "units": {name: problem.units[name] for name in names},
-            "shape": data.shape,
-            "chunk": tile(data.shape, options.chunk_size),
-            "samples": data.samples,
-            "channels": list(problem.data.channels),
-            "options": options.numbers(),
-            "stack": repr(stack),
-            "noise_assumed": problem.objective == "likelihood" and is_assumed(noise or Noise(), problem.data),
-            "version": lj.__version__,
-            "fingerprints": identity,
-        }
-        store = create(path, about, arrays)
-
-    # 3. all chunks
-    job = job_of(store, problem, data.geometry is None, options, data)
-    if failures := _fit_chunks(store, job, client, options):
-        named = [*failures[:NAMED], *([f"and {len(failures) - NAMED} more"] if len(failures) > NAMED else [])]
-        raise ValueError(f"{path}: {'; '.join(named)}; all other chunks are done, and another run does these")
-
-    # 4. neighbours held together
-    if options.spatial_prior is not None:
-        smooth_map(store, job, client, options)
+        # 4. neighbours held together
+        if options.spatial_prior is not None:
+            smooth_map(store, job, connection, options)
     return open_map(path)
 
 
-def _identity(stack: Any, noise: Noise | None, transport: Any, samples: int, options: MapOptions) -> dict[str, str]:
+def _identity(stack: Any, noise: Noise, transport: Any, samples: int, options: MapOptions) -> dict[str, str]:
     """Fingerprints of what makes a fit, by name; of a transport that is a function, by what it predicts."""
 
     def parts_of(tree: Any) -> list[Any]:
@@ -174,7 +170,7 @@ def _fit_chunks(store: Store, job: Job, client: Any, options: MapOptions) -> lis
         if isinstance(result, Failure):
             failures.append(f"chunk {block_words(blocks[index])}: {result.error}")
         else:
-            fitted, poor = fitted + result["fitted"], poor + result["poor"]
+            fitted, poor = fitted + result[0], poor + result[1]
         done += 1
         options.progress("map", done, total, f"{100.0 * poor / fitted:.1f} % poor" if fitted else "")
     if client is None:  # of a cluster, some may still write what others have done
@@ -182,17 +178,18 @@ def _fit_chunks(store: Store, job: Job, client: Any, options: MapOptions) -> lis
     return failures
 
 
-def work(job: Job, block: Block) -> dict[str, int]:
-    """Fit a chunk and write it; returns how many texels have which flag."""
+def work(job: Job, block: Block) -> tuple[int, int]:
+    """Fit a chunk and write it; returns how many texels are fitted, and how many of them are poor."""
     results = fit_chunk(job, block)
     job.store.write(block, results)
-    return {meaning: int(np.sum(results["flags"] & bit > 0)) for meaning, bit in FLAGS.items()}
+    fitted, poor = (int(np.sum(results["flags"] & FLAGS[meaning] > 0)) for meaning in ("fitted", "poor"))
+    return fitted, poor
 
 
 def fit_chunk(job: Job, block: Block) -> dict[str, NDArray[Any]]:
     """The arrays of a store for one chunk, by their names, each of the chunk's shape."""
     mask, texels = job.texels(block)
-    problem, size, shape, mask = job.problem, job.options.chunk_size, mask.shape, mask.reshape(-1)
+    problem, shape, mask = job.problem, mask.shape, mask.reshape(-1)
     names = problem.names
     results = {name: np.full(texels.number, fill, dtype) for name, (dtype, fill) in arrays_of(names).items()}
     results["measurements"][:] = texels.measurements
@@ -203,7 +200,7 @@ def fit_chunk(job: Job, block: Block) -> dict[str, NDArray[Any]]:
     fitted = np.flatnonzero(mask & enough)
     if len(fitted):
         rows = texels.rows(fitted)
-        best, poor, restarted = search(problem, job.starts, rows, size, job.options)
+        best, poor, restarted = search(problem, job.starts, rows, job.options)
         finite, (errors, at_bound, unidentified) = best.finite, standard_errors(problem, best, rows)
         numbers = {"reduced_chi_square": reduced_chi_square(best, rows)}
         for place, name in enumerate(names):

@@ -20,9 +20,9 @@ from fits.maps.common import fit_common, with_common
 from fits.maps.emulator import Emulator, emulate, with_emulator
 from fits.maps.inputs import Block, MapData, Measured
 from fits.maps.options import MapOptions
-from fits.maps.search import Results, Starts, fit_first, reduced_chi_square, search, sigmas, starts_at
+from fits.maps.search import Starts, fit_pilot_texels, reduced_chi_square, sigmas, starts_at
 from fits.maps.store import PILOT, Store
-from fits.maps.texels import Texels, make_texels, with_own_directions
+from fits.maps.texels import Fits, Texels, make_texels, with_own_directions
 from fits.optimise.fit import fit
 from fits.optimise.multi_start import start_points
 from fits.optimise.resolution import has_rays, leaves_rays_open, resolution_in_words, resolutions
@@ -45,13 +45,8 @@ MOST_PARAMETERS = 32
 class Job:
     """What all chunks of a map have in common, for those who do the work.
 
-    Attributes:
-        path: of the store.
-        prototype: the problem of a texel, with common parameters held, and a resolution.
-        emulator: in the place of its transport; None: that itself.
-        starts: of all fits but those of the pilot.
-        options: of the map; its chunk size is that of the program.
-        data: the measurements.
+    path: of the store. prototype: the problem of a texel, with common parameters held, and a resolution. emulator: in
+    the place of its transport, if any. starts: of the fits of all chunks. options: their chunk size is the program's.
     """
 
     path: str
@@ -123,13 +118,12 @@ def pilot_texels(data: MapData, count: int) -> Texels:
 
 
 def make_prototype(
-    pilot: Texels, data: MapData, stack: Any, noise: Noise | None, transport: Any, options: MapOptions
+    pilot: Texels, data: MapData, stack: Any, noise: Noise, transport: Any, options: MapOptions
 ) -> Problem:
     """A problem with the measurements of a typical texel, in whose place those of each texel come.
 
     ValueError for one that a map cannot have.
     """
-    noise = Noise() if noise is None else noise
     if noise.discrepancy:
         raise ValueError("noise.discrepancy is given; fits of maps have independent noise only")
 
@@ -177,14 +171,9 @@ def make_prototype(
 def fit_pilot(
     problem: Problem, texels: Texels, shape: tuple[int, ...], options: MapOptions
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Find resolution, emulator, common parameters and starts from the pilot texels of a map of this shape.
-
-    Returns what a store keeps of that: arrays, and what its root says.
-
-    Raises:
-        ValueError: an emulator is required that cannot be made, or no texel has a fit.
-    """
-    own_directions, size = texels.wi is not None, options.chunk_size
+    """Resolution, emulator, common parameters and starts, from the pilot texels of a map of this shape: the arrays that
+    a store keeps of them, and what its root says. ValueError: there is no emulator that is required, or no fit."""
+    own_directions = texels.wi is not None
     texels = texels.rows(texels.measurements >= len(problem.names)).with_floor(least_floor(problem))
 
     # the resolution that a fit of its own data ends with
@@ -214,29 +203,26 @@ def fit_pilot(
                 raise ValueError(f"emulator: {numerical['emulator']}")
         ready = map_problem(problem, own_directions, emulator)
         points = start_points(ready, options.starts, options.seed)
-        starts = starts_at(ready, fit_first(ready, points, texels, size).distinct(), own_directions, size)
-        results = search(ready, starts, texels, size, options)
+        fits = fit_pilot_texels(ready, points, texels, options)
         if own_directions or (known is None and not has_rays(problem)):
             break
         finer = None if known is None else known.finer(problem.transport)  # type: ignore[arg-type]
         fine = None if finer is None else replace(problem, transport=finer)
-        error = 0.0 if fine is None else _numerical_error(ready, fine, results, texels)
+        error = 0.0 if fine is None else _numerical_error(ready, fine, fits, texels)
         if known is None or not known.open or fine is None or error <= options.numerical_error:
             if has_rays(problem):
-                error += _numerical_error(ready, problem.with_other_rays(), results, texels)
+                error += _numerical_error(ready, problem.with_other_rays(), fits, texels)
             numerical["resolution"] = resolution_in_words(problem, known)
             break
         problem = fine
     options.progress("pilot", texels.number, texels.number)
 
-    reduced = reduced_chi_square(results.fits, texels)
-    finite = reduced[np.isfinite(reduced)]
-    arrays = {"starts": results.fits.distinct(), **({} if emulator is None else emulator.arrays())}
+    arrays = {"starts": fits.distinct(), **({} if emulator is None else emulator.arrays())}
+    reduced = reduced_chi_square(fits, texels)
     has_words = isinstance(problem.transport, lj.Transport) or problem.transport == "auto"
     kept = {
-        "reduced_chi_square": float(np.median(finite)) if finite.size else None,
-        "poor_above": options.pilot_factor * float(np.quantile(finite, options.pilot_quantile)) if finite.size else 0.0,
         "floor": None if is_free(problem.noise.floor) else problem.noise.floor,
+        "poor_above": options.pilot_factor * float(np.quantile(reduced[fits.finite], options.pilot_quantile)),
         "transport": transport_to_dict(problem.transport) if has_words else None,  # type: ignore[arg-type]
         "rings": None if problem.instrument is None else problem.instrument.rings,
     }
@@ -244,33 +230,31 @@ def fit_pilot(
     return arrays, about | {"numerical": numerical | {"error": error}}
 
 
-def job_of(store: Store, problem: Problem, own_directions: bool, options: MapOptions, data: MapData) -> Job:
+def job_of(store: Store, problem: Problem, options: MapOptions, data: MapData) -> Job:
     """The work of a map by what a store keeps of its pilot, see `fit_pilot`; problem: as that was called with."""
     kept, group = store.attributes["pilot"], store.load_group(PILOT)
     assert group is not None
     arrays, _ = group
-    if kept["floor"] is not None:
-        problem = replace(problem, noise=replace(problem.noise, floor=kept["floor"]))
     if kept["transport"] is not None:
         problem = replace(problem, transport=transport_from_dict(kept["transport"]))
     if problem.instrument is not None:
         problem = replace(problem, instrument=replace(problem.instrument, rings=kept["rings"]))
     if common := store.attributes["common"]:
         problem = with_common(problem, {name: float(one["value"]) for name, one in common.items()})
-    emulator = Emulator.of(arrays) if "orders" in arrays else None
-    ready, size = map_problem(problem, own_directions, emulator), options.chunk_size
-    starts = starts_at(ready, arrays["starts"], own_directions, size, kept["poor_above"])
+    emulator, own_directions = Emulator.of(arrays) if "orders" in arrays else None, data.geometry is None
+    ready = map_problem(problem, own_directions, emulator)
+    starts = starts_at(ready, arrays["starts"], own_directions, options.chunk_size, kept["poor_above"])
     return Job(str(store.path.resolve()), problem, emulator, starts, replace(options, progress=silent), data)
 
 
-def _numerical_error(ready: Problem, fine: Problem, results: Results, texels: Texels) -> float:
+def _numerical_error(ready: Problem, fine: Problem, fits: Fits, texels: Texels) -> float:
     """Largest numerical error of the pilot, in standard deviations, by a finer problem."""
-    good = np.isfinite(results.fits.cost)
-    fits, rows = results.fits.rows(good), texels.rows(good)
+    good = np.isfinite(fits.cost)
+    fits, texels = fits.rows(good), texels.rows(good)
     exact = predict_all(fine, fits.vector)
-    own = np.where(rows.used, np.sqrt(rows.variance), 0.0)
+    own = np.where(texels.used, np.sqrt(texels.variance), 0.0)
     error = np.abs(fits.predicted - exact) / np.hypot(sigmas(ready, fits.vector, exact), own)
-    return float(np.max(np.where(rows.used, error, 0.0), initial=0.0))
+    return float(np.max(np.where(texels.used, error, 0.0), initial=0.0))
 
 
 def predict_all(problem: Problem, vectors: Floats) -> Floats:

@@ -37,14 +37,8 @@ NO_VALUE = "#d4d4d4"
 
 @dataclass(frozen=True)
 class Summary:
-    """Counts of texels, and quartiles over those that are fitted.
-
-    Attributes:
-        texels, done: texels of the map, and of them those that are fitted or excluded.
-        counts: texels with each flag.
-        at_bound: texels at which each parameter is at a bound.
-        quartiles: of each array of the store, such as "values/base.albedo", where it is finite; NaN if it nowhere is.
-    """
+    """Counts of texels: of the map, of those that are fitted or excluded, with each flag, and with each parameter at a
+    bound; and quartiles of each array of the store over the fitted texels where it is finite, NaN if it nowhere is."""
 
     texels: int
     done: int
@@ -104,8 +98,7 @@ def verdict(summary: Summary, map: FittedMap) -> tuple[list[str], bool]:
     assumed = about.get("noise_assumed", False)
     words += [NOISE_ASSUMED] if assumed else []
     low, median, high = summary.quartiles["reduced_chi_square"]
-    own = [name for name in map.names if name not in about["common"]]
-    freedom = summary.quartiles["measurements"][1] - len(own)
+    freedom = summary.quartiles["measurements"][1] - len(map.names)
     spread = math.sqrt(2.0 / freedom) if freedom > 0 else math.inf
     far = option("chi_square_sigmas") * spread
     if math.isfinite(median):
@@ -147,23 +140,16 @@ def verdict(summary: Summary, map: FittedMap) -> tuple[list[str], bool]:
     if map.numerical_error is not None:
         but = "" if accurate else ": a finer resolution may give other values"
         words.append(f"The numerical error of the model is at most {error:.2g} standard deviations in the pilot{but}.")
-    words += smoothing_words(map)
+    if (smoothing := map.smoothing) is not None:
+        scales = ", ".join(f"{name} {one:g}" for name, one in smoothing["prior"]["scale"].items())
+        settled = "" if smoothing["settled"] else ": it has not settled"
+        words.append(
+            f"Smoothed beside the plain fit by block alternation ({smoothing['prior']['kind'].replace('_', ' ')}, of "
+            f"the bounds: {scales}), in {smoothing['rounds']} rounds; in the last one texels moved by at most "
+            f"{smoothing['largest_moves'][-1]:.2g} standard errors{settled}."
+        )
+        words.append("Errors of the smoothed map are conditional on the values of the neighbours.")
     return words, finished and converged and explained and few_flagged and joint and not unknown and accurate
-
-
-def smoothing_words(map: FittedMap) -> list[str]:
-    """How a map was smoothed, and whether that has settled, in a few sentences; none if it was not."""
-    about = map.smoothing
-    if about is None:
-        return []
-    scales, settled = about["prior"]["scale"], "" if about["settled"] else ": it has not settled"
-    each = ", ".join(f"{name} {one:g}" for name, one in scales.items())
-    return [
-        f"Smoothed beside the plain fit by block alternation ({about['prior']['kind'].replace('_', ' ')}, of the "
-        f"bounds: {each}), in {about['rounds']} rounds; in the last one texels moved by at most "
-        f"{about['largest_moves'][-1]:.2g} standard errors{settled}.",
-        "Errors of the smoothed map are conditional on the values of the neighbours.",
-    ]
 
 
 def share(part: float, whole: float) -> str:
@@ -175,32 +161,20 @@ def share(part: float, whole: float) -> str:
 # ---- in tables ----
 
 
-def count_table(summary: Summary) -> Table:
-    """How many texels have each flag, and which share of the map."""
-    rows = [("of the map", summary.texels, "")]
-    if summary.done < summary.texels:
-        rows.append(("done so far", summary.done, share(summary.done, summary.texels)))
-    for flag, count in summary.counts.items():
-        if count or flag == "fitted":
-            of_map = flag in ("fitted", "masked", "too_few_measurements", "failed")
-            percent = share(count, summary.texels) if of_map else f"{share(count, summary.fitted)} of the fitted"
-            rows.append((flag.replace("_", " "), count, percent))
-    for name, count in summary.at_bound.items():
-        if count:
-            rows.append((f"at a bound: {name}", count, f"{share(count, summary.fitted)} of the fitted"))
-    return Table("Texels", ("", "texels", "share"), tuple((words, f"{count:,}", part) for words, count, part in rows))
-
-
 def quartile_table(summary: Summary, map: FittedMap) -> Table:
-    """Quartiles over the fitted texels: of each parameter, of its standard error, and of how well texels are fitted."""
+    """Quartiles over the fitted texels: of each parameter, of its standard error, and of how well texels are fitted;
+    and how many texels have a parameter at a bound."""
 
     def words(path: str) -> tuple[str, ...]:
         return tuple(f"{value:.4g}" if math.isfinite(value) else "" for value in summary.quartiles[path])
 
-    rows = [(name, *words(f"values/{name}"), *words(f"errors/{name}"), map.units[name]) for name in map.names]
-    rows.append(("chi2/dof", *words("reduced_chi_square"), "", "", "", "1"))
-    rows.append(("measurements", *words("measurements"), "", "", "", "1"))
-    columns = ("", "25 %", "median", "75 %", "error: 25 %", "error: median", "error: 75 %", "unit")
+    rows = [
+        (name, *words(f"values/{name}"), *words(f"errors/{name}"), map.units[name], share(count, summary.fitted or 1))
+        for name, count in summary.at_bound.items()
+    ]
+    rows.append(("chi2/dof", *words("reduced_chi_square"), "", "", "", "1", ""))
+    rows.append(("measurements", *words("measurements"), "", "", "", "1", ""))
+    columns = ("", "25 %", "median", "75 %", "error: 25 %", "error: median", "error: 75 %", "unit", "at a bound")
     return Table("Quartiles over the fitted texels", columns, tuple(rows), "Of errors, those that are finite.")
 
 
@@ -213,8 +187,7 @@ def common_table(map: FittedMap) -> Table:
 
 def made_table(map: FittedMap) -> Table:
     """How the map was made: the model but for the stack, the pilot, and options that are not the usual ones."""
-    about, pilot = map.attributes, map.attributes["pilot"]
-    limit = pilot["poor_above"]
+    about = map.attributes
     options = (f"{name} {value}" for name, value in about["options"].items() if value != getattr(MapOptions, name))
     rows = {
         "store": map.path,
@@ -222,7 +195,7 @@ def made_table(map: FittedMap) -> Table:
         **about["numerical"],
         "noise": about["noise"],
         "data": f"{about['samples']} measurements a texel, of {', '.join(about['channels'])}",
-        "median of the pilot": f"chi2/dof {pilot['reduced_chi_square'] or math.nan:.3g}; poor above {limit:.3g}",
+        "chi2/dof": f"poor above {about['pilot']['poor_above']:.3g}",
         "options": ", ".join(options) or "default",
         "fitted by": f"layerjax {about['version']}",
     }
@@ -240,15 +213,11 @@ def fragment(map: FittedMap) -> str:
 
 
 def report(map: FittedMap, path: str | Path, force: bool = True, progress: Progress = silent) -> Summary:
-    """Write the report of a map to `path`, whole or not at all; returns its numbers.
-
-    Raises:
-        ValueError: `path` exists and `force` is False, or a chunk of the map is damaged.
-    """
+    """Write the report of a map to `path`, whole or not at all, see `fits.report`; returns its numbers."""
     numbers, title = summarise(map), f"Map of {map.path.resolve().name}"
     body = [f"<h1>{html.escape(title)}</h1>", verdict_box(*verdict(numbers, map))]
     flags = _figures(map, ("The gravest flag of each texel.", flag_picture(map.flags)))
-    body.append(section("Texels", flags, count_table(numbers)))
+    body.append(section("Texels", flags))
     if numbers.fitted:
         body.append(section("Values in short", quartile_table(numbers, map), common_table(map)))
         parts = ['<p class="note">Colours run over the middle 98 % of the values.</p>']
@@ -286,13 +255,7 @@ def _figures(map: FittedMap, *figures: tuple[str, Figure]) -> str:
 
 
 def value_picture(values: Floats, title: str, label: str, colours: str, norm: Normalize) -> Figure:
-    """One number of every texel, such as a parameter or its error; grey where it is not finite.
-
-    Args:
-        values: of the whole map.
-        title, label: what stands above, and what the numbers are, with their unit.
-        colours, norm: of matplotlib.
-    """
+    """One number of every texel, such as a parameter or its error; grey where it is not finite."""
     finite, cmap = np.isfinite(values), mpl.colormaps[colours].with_extremes(bad=NO_VALUE)
     legend = {} if finite.all() else {NO_VALUE: "no value"}
     return _map_picture(np.where(finite, values, np.nan), title, legend, label, cmap=cmap, norm=norm)

@@ -5,7 +5,6 @@ fits as well is not looked for.
 """
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -14,7 +13,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from fits.maps.options import MapOptions
-from fits.maps.texels import Fits, Integers, Linearisation, Texels, Truths, fit_texels, linearise_at, to_units
+from fits.maps.texels import Fits, Integers, Linearisation, Texels, fit_texels, linearise_at, to_units
 from fits.problem.model import Model
 from fits.problem.problem import Problem
 
@@ -39,14 +38,6 @@ class Starts:
     explained: float = 0.0
 
 
-class Results(NamedTuple):
-    """What is found of M texels: fits, and which are poor or were fitted again, (M,) each."""
-
-    fits: Fits
-    poor: Truths
-    restarted: Truths
-
-
 def starts_at(problem: Problem, vectors: Floats, own_directions: bool, size: int, explained: float = 0.0) -> Starts:
     """The starts at these vectors (K, P); own_directions: of each texel; size: of the program."""
     vectors = vectors[:MOST_PREDICTED] if own_directions else vectors
@@ -63,14 +54,30 @@ def fit_first(problem: Problem, points: Floats, pilot: Texels, size: int) -> Fit
     return best
 
 
-def search(problem: Problem, starts: Starts, texels: Texels, size: int, options: MapOptions) -> Results:
-    """Fit each texel; size: of the program, texels at a time."""
+def fit_pilot_texels(problem: Problem, points: Floats, texels: Texels, options: MapOptions) -> Fits:
+    """The best fits of a pilot: of a few texels from all of the points, of the others from where these ended."""
+    first = fit_first(problem, points, texels, options.chunk_size)
+    starts = starts_at(problem, first.distinct(), texels.wi is not None, options.chunk_size)
+    return search(problem, starts, texels, options)[0]
+
+
+def search(
+    problem: Problem, starts: Starts, texels: Texels, options: MapOptions
+) -> tuple[Fits, NDArray[np.bool_], NDArray[np.bool_]]:
+    """The fits of M texels, and which of them are poor or were fitted again, (M,) each."""
+    size = options.chunk_size
     order = likeliest(problem, starts, texels, size, options.restarts + 1)
     which = None if starts.known is None else order[:, 0]
     best = fit_texels(problem, starts.units[order[:, 0]], texels, size, known=starts.known, which=which, fresh=False)
-    limit, restarted = explained_chi_square(problem, starts, texels, options), np.zeros(texels.number, bool)
+    restarted = np.zeros(texels.number, bool)
 
-    def poor() -> Truths:
+    # the reduced chi-square that noise and the pilot explain
+    limit = np.full(texels.number, starts.explained or np.inf)
+    if problem.objective == "likelihood" and problem.noise.tails == "gaussian":
+        freedom = np.maximum(texels.measurements - len(problem.names), 1)
+        limit = np.maximum(starts.explained, stats.chi2.isf(options.poor_probability, freedom) / freedom)
+
+    def poor() -> NDArray[np.bool_]:
         """Which fits are worse than noise and pilot explain, or have not converged."""
         return ~((reduced_chi_square(best, texels) <= limit) & best.converged)
 
@@ -78,20 +85,12 @@ def search(problem: Problem, starts: Starts, texels: Texels, size: int, options:
         if len(rows := np.flatnonzero(poor())):
             restarted[rows] = True
             best.improve(rows, fit_texels(problem, starts.units[order[rows, place]], texels.rows(rows), size))
-    return Results(best, poor() & best.converged, restarted)
+    return best, poor() & best.converged, restarted
 
 
 def reduced_chi_square(fits: Fits, texels: Texels) -> Floats:
     """Chi-square over degrees of freedom, (M,)."""
     return np.asarray(fits.chi_square) / np.maximum(texels.measurements - fits.vector.shape[1], 1)
-
-
-def explained_chi_square(problem: Problem, starts: Starts, texels: Texels, options: MapOptions) -> Floats:
-    """The reduced chi-square that noise and the pilot explain, (M,)."""
-    if problem.objective == "likelihood" and problem.noise.tails == "gaussian":
-        freedom = np.maximum(texels.measurements - len(problem.names), 1)
-        return np.maximum(starts.explained, stats.chi2.isf(options.poor_probability, freedom) / freedom)
-    return np.full(texels.number, starts.explained or np.inf)
 
 
 def likeliest(problem: Problem, starts: Starts, texels: Texels, size: int, most: int) -> Integers:

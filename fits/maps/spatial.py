@@ -9,7 +9,6 @@ Differences are in the unit box, between the bounds of a parameter or of its log
 state after each round is the group ``smoothed`` of the store, from which an interrupted run resumes.
 """
 
-import json
 import math
 from contextlib import suppress
 from typing import Any, NamedTuple
@@ -35,11 +34,9 @@ def neighbour_prior(kind: Kind, scales: Floats, units: Floats, fitted: Truths) -
     """The Gaussian by which the neighbours of each texel hold it: its centre in the unit box and its precision, 0 where
     no edge ends, (map shape, P) each.
 
-    Its logarithm and that of the spatial prior have the same slope where the texel is, and it lies below elsewhere:
-    what lowers the cost with it lowers that with the spatial prior at least as much.
-
-    scales: (P,), infinite where a parameter is not smoothed. units: (map shape, P), in the unit box, finite where
-    `fitted`, (map shape).
+    Its logarithm has the slope of the spatial prior's where the texel is, and lies below it elsewhere: what lowers the
+    cost with it lowers that with the spatial prior. scales: (P,), infinite where a parameter is not smoothed. units:
+    (map shape, P), finite where `fitted`, (map shape).
     """
     total, moment = np.zeros((2, *units.shape))
     with np.errstate(invalid="ignore"):
@@ -56,14 +53,11 @@ def neighbour_prior(kind: Kind, scales: Floats, units: Floats, fitted: Truths) -
 
 
 class Half(NamedTuple):
-    """The texels of one colour in a chunk.
-
-    places: of M texels in the block, counted along its axes. units: where they are, (M, P), in the unit box. centre,
-    inverse_sd: how strongly their neighbours hold them, see `Texels`.
-    """
+    """The M texels of one colour in a chunk: which of the block, where they are, (M, P), in the unit box, and how
+    strongly their neighbours hold them, see `Texels`."""
 
     block: Block
-    places: NDArray[np.int64]
+    mine: Truths
     units: Floats
     centre: Floats
     inverse_sd: Floats
@@ -72,7 +66,7 @@ class Half(NamedTuple):
 def work(job: Job, task: Half) -> tuple[Floats, Floats]:
     """Fit texels given their neighbours: vectors and errors, (M, P), NaN where there is no finite fit."""
     problem = job.problem
-    rows = job.texels(task.block)[1].rows(task.places)
+    rows = job.texels(task.block)[1].rows(task.mine.reshape(-1))
     rows = rows._replace(centre=task.centre, inverse_sd=task.inverse_sd)
     best = fit_texels(problem, task.units, rows, job.options.chunk_size, fresh=False)
     errors, finite = standard_errors(problem, best, rows)[0], best.finite[:, None]
@@ -82,9 +76,7 @@ def work(job: Job, task: Half) -> tuple[Floats, Floats]:
 def smooth_map(store: Store, job: Job, client: Any, options: MapOptions) -> None:
     """Smooth a map that is fitted whole, into a group of its store, from where an earlier call stopped.
 
-    Raises:
-        ValueError: measurements that cannot be read again: they are named, and what was done of whole rounds is kept.
-        OSError: of the store.
+    ValueError: measurements that cannot be read again; whole rounds are kept.
     """
     names, problem, prior = store.names, job.problem, options.spatial_prior
     assert prior is not None
@@ -98,7 +90,7 @@ def smooth_map(store: Store, job: Job, client: Any, options: MapOptions) -> None
     kept, moves = None, list[float]()
     with suppress(ValueError):  # damaged: smoothed anew
         kept = store.load_group(SMOOTHED)
-    if kept is not None and kept[1]["smoothing"]["prior"] == json.loads(json.dumps(plain(said))):
+    if kept is not None and kept[1]["smoothing"]["prior"] == plain(said):
         if kept[1]["finished"]:
             return
         moves = list(kept[1]["smoothing"]["largest_moves"])
@@ -122,18 +114,17 @@ def smooth_map(store: Store, job: Job, client: Any, options: MapOptions) -> None
             for block in blocks_of(fitted.shape, store.chunk):
                 if (mine := coloured[block]).any():
                     at, to, inverse_sd = (one[block][mine] for one in (units, centre, np.sqrt(precision)))
-                    tasks.append(Half(block, np.flatnonzero(mine), at, to, inverse_sd))
+                    tasks.append(Half(block, mine, at, to, inverse_sd))
             for index, result in run(work, job, tasks, client=client):
-                block, places, *_ = tasks[index]
+                block, mine, *_ = tasks[index]
                 if isinstance(result, Failure):
                     raise ValueError(
                         f"{store.path}: smoothing of chunk {block_words(block)}: {result.error}; the map is fitted, "
                         "and another run resumes after the last whole round"
                     )
                 for whole, part in zip((vectors, errors), result, strict=True):
-                    chunk = whole[block].reshape(-1, len(names))  # a copy
-                    chunk[places] = np.where(np.isfinite(result[0]), part, chunk[places])
-                    whole[block] = chunk.reshape(whole[block].shape)
+                    chunk = whole[block]  # a view
+                    chunk[mine] = np.where(np.isfinite(result[0]), part, chunk[mine])
         # how far a texel moved at most, in standard errors: those of now, or of before where there are none
         error = np.where(np.isfinite(errors), errors, np.where(np.isfinite(errors_before), errors_before, np.inf))
         share = np.abs(units_now() - before) * widths(problem, vectors) / np.where(error > 0.0, error, np.inf)

@@ -12,7 +12,7 @@ import itertools
 import os
 import shutil
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -139,11 +139,8 @@ class FittedMap:
     @property
     def smoothing(self) -> dict[str, Any] | None:
         """How the map was smoothed: its prior, rounds, largest moves, whether it settled; None if it was not."""
-        try:
-            about: Any = self.root[SMOOTHED].attrs[KEY] if SMOOTHED in self.root else {}
-        except ValueError as error:
-            raise ValueError(f"{self.path}/{SMOOTHED}: damaged, {one_line(error)}") from None
-        return about["smoothing"] if about.get("finished") else None
+        about = self.about(SMOOTHED)
+        return about["smoothing"] if about and about["finished"] else None
 
     @property
     def reduced_chi_square(self) -> Floats:
@@ -199,12 +196,13 @@ class FittedMap:
 
     def read(self, path: str) -> Any:
         """A whole array. ValueError, on one line, that names it: a chunk is damaged."""
-        try:
-            return np.asarray(self[path][...])
-        except KeyError:  # says what there is
-            raise
-        except Exception as error:  # codecs raise what they like
-            raise ValueError(f"{self.path}/{path}: damaged, {one_line(error)}") from None
+        with _damage_named(f"{self.path}/{path}"):
+            return np.asarray(self.root[path][...])  # type: ignore[index]
+
+    def about(self, group: str) -> dict[str, Any] | None:
+        """What the group of the pilot or of a spatial prior says of itself; None where it is not there."""
+        with _damage_named(f"{self.path}/{group}"):
+            return self.root[group].attrs[KEY] if group in self.root else None  # type: ignore[return-value]
 
     def __repr__(self) -> str:
         size = " x ".join(map(str, self.shape))
@@ -231,6 +229,14 @@ class _Arrays(Mapping[str, Floats]):
 
     def __len__(self) -> int:
         return len(self._map.names)
+
+
+@contextmanager
+def _damage_named(place: str) -> Iterator[None]:
+    try:
+        yield
+    except Exception as error:  # codecs raise what they like
+        raise ValueError(f"{place}: damaged, {one_line(error)}") from None
 
 
 def open_map(path: str | Path) -> FittedMap:
@@ -305,14 +311,8 @@ class Store(FittedMap):
 
     def load_group(self, name: str) -> tuple[dict[str, np.ndarray], dict[str, Any]] | None:
         """The arrays of a group and what it says of itself; None where it is not there. ValueError: it is damaged."""
-        if not (self.path / name).exists():
-            return None
-        try:
-            group: Any = self.root[name]
-            about: Any = group.attrs[KEY]
-            return {path: np.asarray(group[path][...]) for path in about["arrays"]}, about
-        except Exception as error:  # codecs raise what they like
-            raise ValueError(f"{self.path}/{name}: damaged, {one_line(error)}; --force begins anew") from None
+        about = self.about(name)
+        return None if about is None else ({path: self.read(f"{name}/{path}") for path in about["arrays"]}, about)
 
 
 def _write_group(group: zarr.Group, arrays: Mapping[str, np.ndarray], about: Mapping[str, Any], **options: Any) -> None:
@@ -324,9 +324,8 @@ def _write_group(group: zarr.Group, arrays: Mapping[str, np.ndarray], about: Map
 def create(path: Path, attributes: Mapping[str, Any], pilot: Mapping[str, np.ndarray]) -> Store:
     """Make a store without texels, whole or not at all, in place of what is there.
 
-    attributes: what the root says under the key "layerjax": the names of the parameters, at most 32 (the bits of
-    ``at_bound``), their units, the shape and the chunk (texels along each axis) of the map, and how it was fitted.
-    pilot: arrays that all chunks are fitted with.
+    attributes: what the root says under the key "layerjax": names and units of the parameters, shape and chunk (texels
+    along each axis) of the map, and how it was fitted. pilot: arrays that all chunks are fitted with.
     """
     names, units, shape = attributes["names"], attributes["units"], tuple(attributes["shape"])
     axes = {1: ["texel"], 2: ["row", "column"]}.get(len(shape), [f"axis_{axis}" for axis in range(len(shape))])
@@ -348,16 +347,8 @@ def create(path: Path, attributes: Mapping[str, Any], pilot: Mapping[str, np.nda
 
 
 def resume(path: Path, identity: Mapping[str, str], force: bool) -> Store | None:
-    """The store that is there, if it is of the same fit, without what killed writers left; None: there is none, or one
-    to be replaced.
-
-    Args:
-        identity: fingerprints of what makes this fit, by name.
-        force: replace a map of another fit, or a damaged one.
-
-    Raises:
-        ValueError: something else is there, or a map of another fit (it names what differs), or a damaged one.
-    """
+    """The store that is there, if it is of the fit with these fingerprints; None: there is none, or one that `force`
+    replaces. ValueError: a map of another fit (it names what differs), a damaged one, or something else."""
     restore(path)
     if not os.path.lexists(path):
         return None
@@ -365,12 +356,12 @@ def resume(path: Path, identity: Mapping[str, str], force: bool) -> Store | None
     try:
         store = Store(path)
         if words := differences(store.attributes["fingerprints"], identity):
-            raise ValueError(f"{another(path, words)}; --force, or force=True, throws it away and begins anew")
+            raise ValueError(another(path, words))
         if store.load_group(PILOT) is None:
-            raise ValueError(f"{path}/{PILOT}: damaged, it is not there; --force begins anew")
-    except ValueError:
+            raise ValueError(f"{path}/{PILOT}: damaged, it is not there")
+    except ValueError as error:
         if force:
             return None
-        raise
+        raise ValueError(f"{error}; --force, or force=True, throws it away and begins anew") from None
     store.clean()
     return store

@@ -186,22 +186,13 @@ def fit_texels(
         fresh: whether starts are far from minima.
         most_steps: with 1 each ends where it begins, and what is known there is found.
     """
-    parts = []
-    for first in range(0, texels.number, size):
-        rows = np.arange(first, min(first + size, texels.number))
-        of = None if which is None else which[rows]
-        parts.append(_call(problem, units[rows], texels.rows(rows), size, known, of, fresh, most_steps)[0])
-    return Fits(*(np.concatenate(part) for part in zip(*parts, strict=True)))
+    return _run(problem, units, texels, size, size, known, which, fresh, most_steps)[0]
 
 
 def linearise_at(problem: Problem, units: Floats, size: int) -> Linearisation:
     """What the model says at K points (K, P) of the unit box, by the program that fits: it is compiled already."""
-    parts, nothing = [], make_texels(np.full((1, *problem.model.values.shape), np.nan))
-    for first in range(0, len(units), min(KNOWN, size)):
-        some = units[first : first + min(KNOWN, size)]
-        rows = nothing.rows(np.zeros(len(some), int))
-        parts.append(_call(problem, some, rows, size, None, None, False, 1)[1])
-    return Linearisation(*(np.concatenate(part) for part in zip(*parts, strict=True)))
+    nothing = make_texels(np.full((1, *problem.model.values.shape), np.nan)).rows(np.zeros(len(units), int))
+    return _run(problem, units, nothing, size, min(KNOWN, size), None, None, False, 1)[1]
 
 
 def to_units(problem: Problem, vectors: Floats) -> Floats:
@@ -250,33 +241,34 @@ def standard_errors(problem: Problem, fits: Fits, texels: Texels) -> tuple[Float
 # ---- the program ----
 
 
-def _call(
+def _run(
     problem: Problem,
     units: Floats,
     texels: Texels,
     size: int,
+    share: int,
     known: Linearisation | None,
     which: Integers | None,
     fresh: bool,
     most_steps: int,
 ) -> tuple[Fits, Linearisation]:
-    """Fits of at most `size` texels, and the model where the first `KNOWN` of them ended."""
-    count, shape = texels.number, problem.model.values.shape
-    rows = np.minimum(np.arange(-(-size // LANES) * LANES), count - 1)  # padded by the last, which is not computed
-    number_known, of = (0, np.zeros_like(rows)) if which is None else (count, which[rows])
+    """Fits of M texels, so many at a time; and the model where the first `KNOWN` of each share ended."""
+    shape, parts = problem.model.values.shape, []
     if known is None and texels.wi is None:
         known = Linearisation(np.zeros((1, *shape)), np.zeros((1, units.shape[1], *shape)))
     if known is not None:  # few numbers of starts, and of programs for them
         known = Linearisation(*(np.concatenate([one, np.repeat(one[-1:], -len(one) % KNOWN, axis=0)]) for one in known))
-    numbers = (np.asarray(one) for one in (count, number_known, fresh, most_steps))
-    found, said = problem.call(_program, units[rows], known, of, texels.rows(rows), *numbers)
-    return (
-        Fits(*(np.asarray(part)[:count] for part in found)),
-        Linearisation(*(np.asarray(part)[:count] for part in said)),
-    )
+    for first in range(0, texels.number, share):
+        count = min(share, texels.number - first)
+        rows = first + np.minimum(np.arange(-(-size // LANES) * LANES), count - 1)  # the last again is not computed
+        number_known, of = (0, np.zeros_like(rows)) if which is None else (count, which[rows])
+        numbers = [np.asarray(one) for one in (count, number_known, fresh, most_steps)]
+        found = problem.call(_program, units[rows], known, of, texels.rows(rows), *numbers)
+        parts.append(jax.tree.map(lambda part, count=count: np.asarray(part)[:count], found))
+    return jax.tree.map(lambda *some: np.concatenate(some), *parts)
 
 
-class _Run(NamedTuple):
+class _Descent(NamedTuple):
     """A texel on its way.
 
     rough: whether it goes by `sigma`, (N, C), which is held, as far from the data where levels of noise are free.
@@ -303,10 +295,9 @@ def _program(
 ) -> tuple[Fits, Linearisation]:
     """Fits of the first `number` of M texels, from starts (M, P), of which so many are known at `which` of `known`."""
     begin, step = partial(_begin, model, fresh), partial(_step, model, fresh, most_steps)
-    one = jax.eval_shape(begin, (units[0], texels.rows(0)))
-    _, unravel = ravel_pytree(jax.tree.map(lambda part: jnp.zeros(part.shape, part.dtype), one))
+    _, unravel = ravel_pytree(jax.tree.map(jnp.zeros_like, jax.eval_shape(begin, (units[0], texels.rows(0)))))
 
-    def flat(run: _Run) -> Array:
+    def flat(run: _Descent) -> Array:
         return ravel_pytree(run)[0]
 
     # a row a texel: its start, after the first step where the model is known there
@@ -321,12 +312,12 @@ def _program(
     rows = jnp.concatenate([rows, rows[-1:]])  # the last is of lanes that have no texel
 
     # lanes take their steps, and one whose texel has ended the next texel
-    def tried(run: _Run, row: Texels) -> Linearisation:
+    def tried(run: _Descent, row: Texels) -> Linearisation:
         return _linearise(model_of(model, row), model.box.from_unit(run.state.trial))
 
     def body(carry: tuple[Any, ...]) -> tuple[Any, ...]:
         following, lanes, runs, rows = carry
-        own = texels_at(lanes)
+        own = jax.tree.map(lambda part: part[jnp.minimum(lanes, len(units) - 1)], texels)
         # as a loop of one turn: all that follows would else compute the model again where it needs a part of it
         said = jax.lax.fori_loop(0, jnp.minimum(number, 1), lambda *_: jax.vmap(tried)(runs, own), nothing)
         runs = jax.vmap(step)(runs, own, said)
@@ -338,9 +329,6 @@ def _program(
         next_runs = jax.vmap(unravel)(rows[lanes])  # where a lane resumes, what it has just written
         return following + jnp.sum(runs.stopped), lanes, next_runs, rows
 
-    def texels_at(lanes: Array) -> Texels:
-        return jax.tree.map(lambda part: part[jnp.minimum(lanes, len(units) - 1)], texels)
-
     lanes = jnp.where(jnp.arange(LANES) < number, jnp.arange(LANES), len(units))
     runs = jax.vmap(unravel)(rows[lanes])
     nothing = jax.tree.map(jnp.zeros_like, runs.state.auxiliary)
@@ -348,13 +336,14 @@ def _program(
     *_, rows = jax.lax.while_loop(lambda carry: jnp.any(carry[1] < number), body, carry)
 
     # what is known where they ended
+    def result(row: tuple[Array, Texels]) -> Fits:
+        return _results(model, unravel(row[0]), row[1])
+
     ends = (rows[:-1], texels)
-    shapes = jax.eval_shape(
-        lambda row: _results(model, unravel(row[0]), row[1]), jax.tree.map(lambda part: part[0], ends)
+    empty = jax.tree.map(jnp.zeros_like, jax.eval_shape(jax.vmap(result), ends))
+    return first_mapped(result, ends, number, empty), jax.vmap(lambda row: unravel(row).state.auxiliary)(
+        rows[: min(KNOWN, len(units))]
     )
-    empty = jax.tree.map(lambda part: jnp.zeros((len(units), *part.shape), part.dtype), shapes)
-    found = first_mapped(lambda row: _results(model, unravel(row[0]), row[1]), ends, number, empty)
-    return found, jax.vmap(lambda row: unravel(row).state.auxiliary)(rows[: min(KNOWN, len(units))])
 
 
 def first_mapped(one: Callable[[Any], Any], rows: Any, number: Array, otherwise: Any) -> Any:
@@ -376,17 +365,17 @@ def _linearise(model: Model, vector: Array) -> Linearisation:
     return Linearisation(values, jnp.concatenate([slopes, rest]))
 
 
-def _begin(model: Model, fresh: Array, start: tuple[Array, Texels]) -> _Run:
+def _begin(model: Model, fresh: Array, start: tuple[Array, Texels]) -> _Descent:
     """A texel at its start (P,), before the first step."""
     unit, own = start[0], model_of(model, start[1])
     levels = model.objective == "likelihood" and model.varying
     nothing = jnp.zeros((unit.size, *own.values.shape), unit.dtype)
     state = first_state(unit, jnp.where(fresh, FIRST_DAMPING, NEARBY), Linearisation(nothing[0], nothing))
     sigma, no = own.initial_sigma(model.box.from_unit(unit)) if levels else jnp.zeros(0), jnp.asarray(False)
-    return _Run(fresh & levels, sigma, state, no, no)
+    return _Descent(fresh & levels, sigma, state, no, no)
 
 
-def _step(model: Model, fresh: Array, most_steps: Array, run: _Run, row: Texels, trial: Linearisation) -> _Run:
+def _step(model: Model, fresh: Array, most_steps: Array, run: _Descent, row: Texels, trial: Linearisation) -> _Descent:
     """A texel after a step by what is known of its trial."""
     own = linear(model_of(model, row), trial, model.box.from_unit(run.state.trial))
     likelihood = model.objective == "likelihood"
@@ -419,10 +408,10 @@ def _step(model: Model, fresh: Array, most_steps: Array, run: _Run, row: Texels,
     if levels:  # near the data with sigma held: the same again with the levels of noise free
         begun = first_state(state.point, jnp.where(fresh, FIRST_DAMPING, NEARBY), state.auxiliary)
         state = jax.tree.map(partial(jnp.where, stop & run.rough), begun, state)
-    return _Run(run.rough & ~stop, run.sigma, state, stop & ~run.rough, converged & jnp.isfinite(state.cost))
+    return _Descent(run.rough & ~stop, run.sigma, state, stop & ~run.rough, converged & jnp.isfinite(state.cost))
 
 
-def _results(model: Model, run: _Run, row: Texels) -> Fits:
+def _results(model: Model, run: _Descent, row: Texels) -> Fits:
     """What is known where a texel ended."""
     own, unit, cost = model_of(model, row), run.state.point, run.state.cost
     vector, predicted, finite = model.box.from_unit(unit), run.state.auxiliary.values, jnp.isfinite(cost)

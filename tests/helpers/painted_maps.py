@@ -18,7 +18,7 @@ ATTRIBUTES = {
     "samples": 64,
     "channels": ["value"],
     "common": {"layers[0].f0": {"value": 0.04321, "error": 0.00012, "unit": "1", "converged": True}},
-    "pilot": {"texels": 64, "reduced_chi_square": 1.01, "poor_above": 1.6},
+    "pilot": {"poor_above": 1.6},
     "options": {"starts": 8, "seed": 0},
     "numerical": {},
 }

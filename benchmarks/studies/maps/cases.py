@@ -88,4 +88,4 @@ def job_of(one: StoredMap, chunk: int) -> tuple[Job, list[Block]]:
     data, store, options = map_data(one.values, one.geometry), Store(one.store), MapOptions(chunk_size=chunk)
     texels = pilot_texels(data, options.pilot_texels)
     problem = make_prototype(texels, data, one.stack, one.noise, one.transport, options)
-    return job_of_store(store, problem, False, options, data), list(blocks_of(store.shape, store.chunk))
+    return job_of_store(store, problem, options, data), list(blocks_of(store.shape, store.chunk))

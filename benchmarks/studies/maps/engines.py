@@ -161,14 +161,14 @@ def _solving() -> Iterator[list[float]]:
     """Seconds of each call that solves texels, as they come."""
     spent: list[float] = []
 
-    call = texels._call
+    call = texels._run
 
     def measured(*arguments: Any, **options: Any) -> Any:
         results: list[Any] = []
         spent.append(once(lambda: results.append(call(*arguments, **options))))
         return results[0]
 
-    with patch.object(texels, "_call", measured):
+    with patch.object(texels, "_run", measured):
         yield spent
 
 

@@ -121,7 +121,7 @@ def test_held_out_data_are_scored(work, monkeypatch, layerjax):
 
 def test_predictions_are_written(work, capsys, coat_fit, layerjax):
     save_fit(coat_fit, "result")
-    words = "predict result --incidence 30,70 20 --out new.csv"
+    words = "predict result --incidence 30,70,20 --out new.csv"
     layerjax(words)
     with (work / "new.csv").open() as file:
         rows = list(csv.DictReader(file))
@@ -161,7 +161,7 @@ def test_info_says_what_is_there_and_draws_it(work, monkeypatch, layerjax):
 def test_convert_and_simulate_write_csv(work, coat_data, layerjax):
     layerjax("convert data.csv copy.csv")
     np.testing.assert_array_equal(read(work / "copy.csv").values, coat_data.values)
-    layerjax("simulate --stack coat.toml --incidence 20,40 --azimuth 0 90,45 --noise 0.1 --out new.csv --seed 3")
+    layerjax("simulate --stack coat.toml --incidence 20,40 --azimuth 0,90,45 --noise 0.1 --out new.csv --seed 3")
     first = read(work / "new.csv")
     assert sorted(set(first.theta_i)) == [20.0, 40.0]
     assert len(first.wi) == len(slices([20.0, 40.0], azimuth=[0.0, 90.0, 45.0]).wi)

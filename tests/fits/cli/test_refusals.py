@@ -82,7 +82,7 @@ MAP, MANY = "fit-map map.npy --stack coat.toml --out coat.zarr", "fit-many scans
         (f"{FIT} --zzz=here", "unrecognized argument: --zzz (see layerjax fit --help)"),
         (f"{FIT} --starts 0", "0 given, must be a whole number >= 1"),
         (f"{FIT} --min-retro-angle nan", "nan given, must be a number in [0, 90]"),
-        ("simulate --stack coat.toml --incidence 95.5 200 --out x.csv", "200 given, must be a number in [0, 180]"),
+        ("simulate --stack coat.toml --incidence 95.5,200 --out x.csv", "200 given, must be a number in [0, 180]"),
         ("simulate --stack coat.toml --azimuth 0,x --out x.csv", "'x' given, must be a number in [-360, 360]"),
         (
             "export coat.toml --to rgl --wavelengths 450,1e300 --out x.bsdf",

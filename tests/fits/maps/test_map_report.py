@@ -55,11 +55,8 @@ def test_counts_quartiles_and_the_verdict_are_those_of_the_arrays(map, painted):
     for path in (f"{group}/{name}" for name in NAMES for group in ("values", "errors")):
         each = painted[path][fitted]
         assert numbers.quartiles[path] == pytest.approx(np.percentile(each[np.isfinite(each)], (25, 50, 75)))
-    rows = {row[0]: row[1:] for row in report.count_table(numbers).rows}
-    assert rows["converged"] == ("537", "99.26 % of the fitted")
-    assert rows["masked"] == ("29", "4.83 %")
-    assert rows["at a bound: layers[0].phase.alpha"] == ("25", "4.62 % of the fitted")
     middle = {row[0]: row for row in report.quartile_table(numbers, map).rows}
+    assert [middle[name][-1] for name in NAMES] == ["0 %", "4.62 %", "0 %"]  # at a bound
     assert float(middle["base.albedo"][2]) == pytest.approx(np.median(painted["values/base.albedo"][fitted]), rel=1e-3)
     root = ET.fromstring(f"<div>{map._repr_html_()}</div>")  # of a notebook
     shown = {row[0].text: [cell.text for cell in row] for row in root.iter("tr")}
@@ -96,7 +93,6 @@ def flagged(texels, flag, ratio=RATIO):
 
 SCALED = {factor: changed(reduced_chi_square=factor * RATIO) for factor in (0.3, 1.7, 1e8)}
 LARGE = ATTRIBUTES["pilot"] | {"poor_above": 1.5e8}
-ONE = {NAMES[0]: {"value": 0.5, "error": 0.1, "unit": "1", "converged": True}}
 OFF = {
     "layers[0].ior": {"value": 1.5, "error": 0.1, "unit": "1", "converged": False},
     "layers[0].thickness_mm": {"value": 2.0, "error": np.inf, "unit": "mm", "converged": False},
@@ -124,8 +120,7 @@ LEAVE = GOOD | FLAGS["unidentified"]
         (numbers(SHAPE), {"common": OFF}, False, ["joint fit of common parameters has not converged", "mm, common"]),
         (numbers(SHAPE), {"numerical": {"error": 0.2}}, False, ["0.2 standard deviations in the pilot: a finer"]),
         (numbers(SHAPE), {"chunks": 2}, False, ["The map is not finished: 200 of 600 texels (33.33 %) are done"]),
-        # of 12 measurements two are fitted away
-        (changed(measurements=12, reduced_chi_square=1.0), {"common": ONE}, True, [f"1 ± {np.sqrt(2 / 10):.2g}"]),
+        (changed(measurements=12, reduced_chi_square=1.0), {}, True, [f"1 ± {np.sqrt(2 / 9):.2g}"]),
     ],
 )
 def test_the_verdict_is_a_matter_of_its_thresholds(arrays, more, sound, sentences, tmp_path):
@@ -134,8 +129,6 @@ def test_the_verdict_is_a_matter_of_its_thresholds(arrays, more, sound, sentence
     assert is_sound == sound
     for sentence in sentences:
         assert sentence in " ".join(words)
-    if "chunks" in more:
-        assert ("done so far", "200", "33.33 %") in report.count_table(summarise(map)).rows
     if more.get("common") is OFF:
         rows = (("layers[0].ior", "1.50", "0.10", "1"), ("layers[0].thickness_mm", "2", "unknown", "mm"))
         assert report.common_table(map).rows == rows
@@ -203,7 +196,7 @@ def test_the_command_writes_the_page_beside_the_store_or_says_why_not(tmp_path, 
     zarr.create_group(tmp_path / "other.zarr")
     os.truncate(map.path / "flags" / "c" / "0" / "1", 3)
     for words, message in (
-        ("a.zarr", "exists already (--force overwrites it)"),
+        ("a.zarr", "exists already (--force, or force=True, overwrites it)"),
         ("a.zarr --force", "flags: damaged, "),
         ("a.zarr --compare b", "is not compared"),
         ("a.zarr --out none/a.html", "no directory none"),
