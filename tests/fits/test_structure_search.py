@@ -55,15 +55,6 @@ def test_the_stack_behind_the_data_is_found(found, directory):
     assert fits.load_fit(directory / "haze+diffuse+full").values == values
 
 
-@pytest.mark.slow
-def test_others_get_a_discrepancy_term(data, found):
-    ruled = search(data, LIBRARY, options=OPTIONS, **BY_RULE)
-    noise = {one.name: one.fit.problem.noise.discrepancy for one in ruled.candidates}
-    assert not noise["haze / diffuse"]
-    assert all(noise[name] for name in ("diffuse", "metal", "haze / metal"))
-    assert ruled.best.name == found.best.name
-
-
 def test_a_killed_search_resumes_and_finds_the_same(data, directory, found, monkeypatch):
     """Killed as it holds out incidences of one of four structures: the next run does this one, and no other."""
     whole = Store.read(directory / STORE)

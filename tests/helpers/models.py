@@ -64,10 +64,10 @@ LINE = {"a": Free(0.9, -1.0, 3.0), "b": Free(0.1, -1.0, 3.0)}
 TRUTH = np.array([1.0, 0.5])
 
 
-def line_data(sigma: float = 0.05, seed: int = 0) -> Measurements:
-    """COUNT readings of the line with the parameters TRUTH, with noise."""
+def line_data(sigma: float = 0.05, seed: int = 0, truth: ArrayLike = TRUTH) -> Measurements:
+    """COUNT readings of the line with these parameters, with noise."""
     noise = np.random.default_rng(seed).standard_normal((COUNT, 1))
-    return measured((design(COUNT) @ TRUTH)[:, None] + sigma * noise, sigma)
+    return measured((design(COUNT) @ truth)[:, None] + sigma * noise, sigma)
 
 
 def line_fit(seed: int = 0) -> Fit:

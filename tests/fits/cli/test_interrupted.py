@@ -6,10 +6,9 @@ import sys
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-import numpy as np
 import pytest
 
-from fits import load_fit, load_posterior, sample, save_fit
+from fits import save_fit
 from fits.cli.parser import main
 from fits.optimise import multi_start as starts
 from fits.reports.html import FitReport
@@ -125,32 +124,6 @@ def test_a_fit_on_a_full_disk_keeps_its_starts_and_the_earlier_result(work, caps
     monkeypatch.setattr(FitReport, "write", lambda *_: None)
     assert main(words) == 0
     assert not list(work.glob(".*"))
-
-
-def test_beside_a_running_sampler_others_only_read(work, capsys, coat_fit, monkeypatch):
-    monkeypatch.setattr(FitReport, "page", lambda _: "drawn")
-    for name in ("result", "other"):
-        save_fit(coat_fit, name)
-    directory, chain = work / "result", work / "result" / "chain.db"
-    words = ["sample", "result", "--walkers", "32", "--ess", "1000"]
-    with stopped(words, lambda: chain.is_file() and chain.stat().st_size > 30_000) as process:
-        before = contents(directory)
-        assert {str(chain), f"{chain}.lock"} < set(before)
-        for other in (words, [*words, "--force"], [*MANY_STARTS, "--force"]):
-            assert f"in use by another process ({process.pid})" in refusal(other, capsys)
-        posterior = load_posterior(directory)
-        assert main(["compare", "result", "other", "--no-refit"]) == 0
-        assert main(["report", "result", "--out", "report.html"]) == 0
-        assert contents(directory) == before
-    assert process.returncode == -signal.SIGKILL
-    assert posterior is not None
-    loaded = load_fit(directory)
-    whole = sample(loaded, walkers=32, seed=0, path=chain, ess=1_000)
-    again = sample(loaded, walkers=32, seed=0, ess=1_000)
-    assert 0 < len(posterior.chain) < len(again.chain)
-    np.testing.assert_array_equal(posterior.chain, again.chain[: len(posterior.chain)])
-    np.testing.assert_array_equal(whole.chain, again.chain)
-    assert not (directory / "chain.db.lock").exists()
 
 
 def test_an_interrupted_fit_exits_with_130_and_the_next_resumes_with_the_starts_that_are_done(

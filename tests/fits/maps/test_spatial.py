@@ -90,11 +90,6 @@ def smoothed(tmp_path_factory, plain, fitted):
     return {kind: fitted(shutil.copytree(plain.path, folder / kind), spatial_prior=PRIORS[kind]) for kind in PRIORS}
 
 
-@pytest.fixture(scope="module")
-def gaussian(smoothed):
-    return smoothed["gaussian"]
-
-
 def units_of(values):
     """Numbers of the texels that are fitted, (15, 2), in the unit box."""
     natural = np.stack([np.log(values[THICKNESS][MASK]), values[ALBEDO][MASK]], axis=-1)
@@ -145,7 +140,8 @@ def test_it_ends_where_a_joint_minimisation_does(smoothed, predict, measured, ki
         np.testing.assert_allclose(errors, exact, rtol=0.01)
 
 
-def test_the_plain_fit_stays_and_masked_texels_stay_out(plain, gaussian):
+def test_the_plain_fit_stays_and_masked_texels_stay_out(plain, smoothed):
+    gaussian = smoothed["gaussian"]
     assert plain.smoothed is plain.smoothed_errors is plain.smoothing is None
     assert plain.attributes == gaussian.attributes
     for name in plain.arrays:
@@ -163,7 +159,7 @@ def test_parameters_that_are_not_named_are_not_smoothed(out, fitted):
     assert rough[ALBEDO] < 0.5 < rough[THICKNESS]
 
 
-def test_a_run_that_was_stopped_is_resumed_to_the_bit(out, fitted, gaussian):
+def test_a_run_that_was_stopped_is_resumed_to_the_bit(out, fitted, smoothed):
     def stop(stage, done, total=None, info=""):
         if stage == "smoothing" and done == 2:
             raise KeyboardInterrupt
@@ -175,7 +171,7 @@ def test_a_run_that_was_stopped_is_resumed_to_the_bit(out, fitted, gaussian):
     (out / "smoothed.partial" / "values").mkdir(parents=True)  # killed in the midst of the next
     rounds = []
     again = fitted(out, spatial_prior=GAUSSIAN, progress=lambda stage, done, *_: rounds.append((stage, done)))
-    assert_same(again, gaussian)
+    assert_same(again, smoothed["gaussian"])
     assert next(done for stage, done in rounds if stage == "smoothing") >= 1  # not begun anew
 
 
@@ -189,10 +185,11 @@ def test_data_that_cannot_be_read_again_are_named(out, monkeypatch, fitted):
         fitted(out, spatial_prior=GAUSSIAN)
 
 
-def test_another_prior_smooths_anew_and_fits_nothing_again(tmp_path, smoothed, fitted, gaussian):
+def test_another_prior_smooths_anew_and_fits_nothing_again(tmp_path, smoothed, fitted):
     out, stages = shutil.copytree(smoothed["total_variation"].path, tmp_path / "again.zarr"), []
     before = {path: path.stat().st_mtime_ns for path in out.glob("values/**/c/*/*")}
-    assert_same(fitted(out, spatial_prior=GAUSSIAN, progress=lambda stage, *_: stages.append(stage)), gaussian)
+    again = fitted(out, spatial_prior=GAUSSIAN, progress=lambda stage, *_: stages.append(stage))
+    assert_same(again, smoothed["gaussian"])
     assert "pilot" not in stages
     assert {path: path.stat().st_mtime_ns for path in before} == before
     stages.clear()

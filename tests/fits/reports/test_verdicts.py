@@ -155,6 +155,7 @@ def test_a_stack_that_misses_is_named_though_the_discrepancy_absorbs_all(fitted:
 def test_both_curves_are_drawn_and_the_residuals_are_those_of_the_one_with_the_discrepancy(fitted: Fit) -> None:
     figure = curves_picture({"model": fitted})
     assert isinstance(figure, Figure)
+    assert len(figure.axes) == 8  # four incidences, each with its residuals
     upper, lower = figure.axes[:2]
     curves = {str(line.get_label()): line for line in upper.lines}
     data = fitted.problem.data
