@@ -254,6 +254,7 @@ PAINT = lj.Stack([], lj.Lambertian(Free(0.5, 0.0, 1.0)))
     [
         (lambda: Problem(PAINT, line_data(), lj.RandomWalk()), "RandomWalk is random; use a deterministic one"),
         (lambda: simulate(PAINT, slices(), lj.RandomWalk()), "RandomWalk is random"),
+        (lambda: simulate(PAINT, slices(), noise=5), r"noise is 5; it must be a number in \[0, "),
         (lambda: Problem(PAINT, line_data(), lj.AddingDoubling(tolerance=0.01)), "0.01 needs concrete parameters"),
         (lambda: FitOptions(same_cost=0.0), r"FitOptions.same_cost is 0.0; it must be a number in \(0, inf\)"),
         (lambda: options_from({"tolerance": 1.0}), r"\[options\] has an unknown key 'tolerance'; it must be one of"),
