@@ -178,13 +178,14 @@ from fits.cli.input_output import use_jax
 for words in ([], *([name] for name in COMMANDS)):
     with contextlib.suppress(SystemExit):
         main([*words, "--help"])
+import fits.data.formats
 assert "jax" not in sys.modules
 use_jax()
 assert os.environ["TF_CPP_MIN_LOG_LEVEL"] == "3"  # XLA reads what it may print as it is loaded: it is told before
 """
 
 
-def test_every_command_has_its_help_without_jax_and_alarms_of_the_compiler_are_not_shown() -> None:
+def test_help_and_reading_need_no_jax_whose_alarms_are_not_shown() -> None:
     environment = {name: word for name, word in os.environ.items() if name != "TF_CPP_MIN_LOG_LEVEL"}
     words = [sys.executable, "-c", HELP]
     done = subprocess.run(words, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)

@@ -95,16 +95,6 @@ def test_what_was_found_is_printed_and_a_map_that_did_not_converge_is_doubtful(r
         assert run(**state)[0] == 1
 
 
-def test_an_interrupt_says_that_the_store_is_good(place, capsys, monkeypatch):
-    def interrupted(*_, **__):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("fits.maps.fit_map.fit_map", interrupted)
-    assert main(WORDS) == 130
-    last = capsys.readouterr().err.splitlines()[-1]
-    assert last == "layerjax: interrupted: what was fitted is in coat.zarr; the same command resumes it"
-
-
 @pytest.mark.parametrize(
     ("words", "message"),
     [

@@ -20,6 +20,7 @@ from tests.helpers.tasks import started, wait_until
 
 FIT = ["fit", "data.csv", "--stack", "coat.toml", "--out", "result"]
 MANY_STARTS = [*FIT, "--starts", "200"]
+FIT_MAP = ["fit-map", "map.npy", "--geometry", "view.csv", "--stack", "coat.toml", "--out", "coat.zarr"]
 FIT_MANY = ["fit-many", "scans", "--stacks", "bare.toml", "--out", "out", "--starts", "2", "--processes", "1"]
 
 
@@ -47,6 +48,7 @@ def stopped(words, when):
     [
         ("fits.sampling.sample.sample", ["sample", "result"], "the chain is kept, `layerjax sample result` resumes it"),
         ("fits.batch.fit_one", FIT_MANY, "out keeps what was fitted; the same command resumes it"),
+        ("fits.maps.fit_map.fit_map", FIT_MAP, "what was fitted is in coat.zarr; the same command resumes it"),
         ("fits.structure_search.search", ["search", "data.csv", "--out", "out"], "out keeps what was fitted"),
     ],
 )
