@@ -10,7 +10,7 @@ from fits import Discrepancy, Fit, Free, Measurements, Noise, fit, predict, samp
 from fits.data.scans import select
 from fits.prediction.predict import LEVELS
 from fits.reports.tables import UNRELIABLE, scores_table
-from tests.helpers.models import COUNT, POSITIVE_LINE, along, design, directions, line, line_fit, measured, wrong_line
+from tests.helpers.models import COUNT, POSITIVE_LINE, along, design, directions, line, measured, wrong_line
 
 SIGMA = 0.02
 
@@ -30,30 +30,25 @@ def fitted_to(data: Measurements, discrepancy: bool = True) -> Fit:
     return fit(POSITIVE_LINE, data, transport=line, noise=noise, starts=2)
 
 
-@pytest.fixture(scope="module")
-def found() -> Fit:
-    return line_fit()
-
-
-def test_intervals_of_a_line_are_those_of_regression(found: Fit) -> None:
-    at = predict(found, found.problem.data, draws=4000)
+def test_intervals_of_a_line_are_those_of_regression(result: Fit) -> None:
+    at = predict(result, result.problem.data, draws=4000)
     columns = design(COUNT)
     covariance = np.linalg.inv(columns.T @ columns / 0.05**2)
     expected = np.sqrt(np.sum(columns @ covariance * columns, axis=-1))
     # 4,000 draws: 1.5 % of a standard deviation, at 4 standard errors
     np.testing.assert_allclose(at.latent.sd[:, 0], expected, rtol=0.06)
     np.testing.assert_allclose(at.predictive.sd[:, 0], np.sqrt(expected**2 + 0.05**2), rtol=0.05)
-    np.testing.assert_allclose(at.latent.mean, found.predicted, atol=0.1 * expected.max())
+    np.testing.assert_allclose(at.latent.mean, result.predicted, atol=0.1 * expected.max())
     wide = at.predictive.quantiles[-1] - at.predictive.quantiles[0]
     np.testing.assert_allclose(wide[:, 0], 2 * stats.norm.ppf(0.975) * np.hypot(expected, 0.05), rtol=0.06)
     # a chain says the same
-    by_chain = predict(sample(found, walkers=16, max_steps=4000), found.problem.data, draws=1000)
+    by_chain = predict(sample(result, walkers=16, max_steps=4000), result.problem.data, draws=1000)
     np.testing.assert_allclose(by_chain.predictive.sd, at.predictive.sd, rtol=0.08)
     np.testing.assert_allclose(by_chain.latent.mean, at.latent.mean, atol=0.2 * at.latent.sd.max())
     # draws that may miss a part are said to
     for one, unreliable in ((at, False), (by_chain, False), (replace(at, pareto_k=0.8), True)):
         assert one.reliable != unreliable
-        assert (UNRELIABLE in scores_table(one, found.problem.data, "").note) == unreliable
+        assert (UNRELIABLE in scores_table(one, result.problem.data, "").note) == unreliable
 
 
 @pytest.mark.slow
@@ -120,17 +115,17 @@ def test_noise_elsewhere_is_that_of_what_was_fitted() -> None:
     np.testing.assert_array_equal(at.predictive.quantiles, again.predictive.quantiles)
 
 
-def test_bad_requests_are_refused(found: Fit) -> None:
-    data, at = found.problem.data, predict(found, slices([30.0]), draws=2)
+def test_bad_requests_are_refused(result: Fit) -> None:
+    data, at = result.problem.data, predict(result, slices([30.0]), draws=2)
     named = fit(POSITIVE_LINE, data, transport=line, objective="cube_root", starts=1)
     for call, message in (
         (lambda: at.quantile(0.0), r"level is 0.0; it must be a number in \(0, 1\)"),
         (lambda: at.predictive_quantile(1.0), r"level is 1.0; it must be a number in \(0, 1\)"),
         (lambda: at.scores, "a Geometry was predicted"),
         (lambda: scores(at, data), "the measurements have other directions"),
-        (lambda: predict(found, data, draws=1), "draws: 1 is not a whole number of at least 2"),
+        (lambda: predict(result, data, draws=1), "draws: 1 is not a whole number of at least 2"),
         (lambda: predict(named, data), "a fit of 'cube_root' has no noise model"),
-        (lambda: predict(found, along(data, channels="rgb")), "measurements have the channels r, g, b, the fit c0"),
+        (lambda: predict(result, along(data, channels="rgb")), "measurements have the channels r, g, b, the fit c0"),
     ):
         with pytest.raises(ValueError, match=message):
             call()

@@ -71,20 +71,6 @@ def test_the_report_begins_with_the_verdict_and_lists_the_incidences_that_were_f
     assert text.index('class="verdict') < text.index("<h2>")
 
 
-class Terminal(io.StringIO):
-    def isatty(self) -> bool:
-        return True
-
-
-def printed(table: Table, width: int, patch: pytest.MonkeyPatch) -> str:
-    """What a terminal of that width shows, without its colours."""
-    for name, value in {"COLUMNS": str(width), "LINES": "50", "TERM": "xterm"}.items():
-        patch.setenv(name, value)
-    terminal = Terminal()
-    print_table(table, terminal)
-    return re.sub(r"\x1b\[[0-9;]*m", "", terminal.getvalue())
-
-
 def test_numbers_in_words() -> None:
     """Degrees to two decimals at most, values to two digits of their error."""
     angles = {89.8511: "89.85°", 30.0: "30°", -1e-9: "0°", 55.5: "55.5°", 359.996: "360°"}
@@ -104,7 +90,12 @@ def test_what_is_too_wide_is_folded_and_never_cut(width: int, monkeypatch: pytes
     rows = tuple(
         (f"layers[{k}].thickness", f"{1.23456 * 10**k:.4f}", "weakly identified, direction 1") for k in range(3)
     )
-    text = printed(Table("Fit", ("parameter", "value", "identifiability"), rows), width, monkeypatch)
+    for name, value in {"COLUMNS": str(width), "LINES": "50", "TERM": "xterm"}.items():
+        monkeypatch.setenv(name, value)
+    terminal = io.StringIO()
+    monkeypatch.setattr(terminal, "isatty", lambda: True)
+    print_table(Table("Fit", ("parameter", "value", "identifiability"), rows), terminal)
+    text = re.sub(r"\x1b\[[0-9;]*m", "", terminal.getvalue())  # without its colours
     assert max(map(len, text.splitlines())) <= width
     assert "…" not in text
     assert Counter("".join("".join(row).replace(" ", "") for row in rows)) <= Counter(text)
