@@ -3,7 +3,7 @@
 import signal
 import subprocess
 import sys
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -31,16 +31,6 @@ def refusal(words, capsys):
     assert error.startswith("layerjax: error: ")
     assert not any("error" in line for line in progress)
     return error
-
-
-@contextmanager
-def stopped(words, when):
-    """A `layerjax` command in a process of its own, held where it is once `when` is true, and killed in the end."""
-    with started(["-m", "fits.cli", *words]) as process:
-        wait_until(lambda: process.poll() is not None or when())
-        assert process.poll() is None, "it ended too soon"
-        process.send_signal(signal.SIGSTOP)
-        yield process
 
 
 @pytest.mark.parametrize(
@@ -132,7 +122,10 @@ def test_an_interrupted_fit_exits_with_130_and_the_next_resumes_with_the_starts_
     work, capsys, monkeypatch
 ):
     done = work / ".result.starts"
-    with stopped(MANY_STARTS, lambda: done.is_file() and len(Store.read(done).keys()) > 2) as process:
+    with started(["-m", "fits.cli", *MANY_STARTS]) as process:
+        wait_until(lambda: process.poll() is not None or (done.is_file() and len(Store.read(done).keys()) > 2))
+        assert process.poll() is None, "it ended too soon"
+        process.send_signal(signal.SIGSTOP)
         before = contents(work)
         assert f"result is in use by another process ({process.pid})" in refusal(MANY_STARTS, capsys)
         assert contents(work) == before

@@ -28,14 +28,6 @@ os.replace = slowly
 """
 
 
-def make(folder, shape):
-    """The files of a map in chunks of 16 texels, and the store of an undisturbed run."""
-    write_files(folder, shape)
-    (folder / "sitecustomize.py").write_text(SLOW_DISK)
-    assert main(command(folder, folder / "whole.zarr")) == 0
-    return folder, open_map(folder / "whole.zarr")
-
-
 def chunks_of(store):
     """How many chunks a store has."""
     return sum(1 for path in store.glob("flags/c/*/*") if path.suffix != ".partial")
@@ -58,7 +50,11 @@ def workers_of(process):
 def test_killed_at_random_moments(tmp_path, kills):
     """The same command repeated until it has been killed so many times, now and then as a whole and else one of its
     workers, after a few chunks each, at any moment."""
-    folder, whole = make(tmp_path, (16, 16) if kills == 2 else (80, 40))
+    folder = tmp_path
+    write_files(folder, (16, 16) if kills == 2 else (80, 40))  # in chunks of 16 texels
+    (folder / "sitecustomize.py").write_text(SLOW_DISK)
+    assert main(command(folder, folder / "whole.zarr")) == 0
+    whole = open_map(folder / "whole.zarr")
     (tmp_path / "many").mkdir()
     out, chunks = tmp_path / "many" / "coat.zarr", whole.flags.size // 16
     choice, killed, every = random.Random(kills), Counter(), min(5, kills)

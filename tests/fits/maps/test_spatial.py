@@ -73,21 +73,15 @@ def fitted(measured):
 
 
 @pytest.fixture(scope="module")
-def plain(tmp_path_factory, fitted):
+def whole(tmp_path_factory, fitted):
     return fitted(tmp_path_factory.mktemp("map") / "plain.zarr")
 
 
-@pytest.fixture
-def out(tmp_path, plain):
-    """A copy of its store."""
-    return shutil.copytree(plain.path, tmp_path / "coat.zarr")
-
-
 @pytest.fixture(scope="module")
-def smoothed(tmp_path_factory, plain, fitted):
+def smoothed(tmp_path_factory, whole, fitted):
     """The maps with a spatial prior of each kind."""
     folder = tmp_path_factory.mktemp("map")
-    return {kind: fitted(shutil.copytree(plain.path, folder / kind), spatial_prior=PRIORS[kind]) for kind in PRIORS}
+    return {kind: fitted(shutil.copytree(whole.path, folder / kind), spatial_prior=PRIORS[kind]) for kind in PRIORS}
 
 
 def units_of(values):
@@ -140,12 +134,12 @@ def test_it_ends_where_a_joint_minimisation_does(smoothed, predict, measured, ki
         np.testing.assert_allclose(errors, exact, rtol=0.01)
 
 
-def test_the_plain_fit_stays_and_masked_texels_stay_out(plain, smoothed):
+def test_the_plain_fit_stays_and_masked_texels_stay_out(whole, smoothed):
     gaussian = smoothed["gaussian"]
-    assert plain.smoothed is plain.smoothed_errors is plain.smoothing is None
-    assert plain.attributes == gaussian.attributes
-    for name in plain.arrays:
-        np.testing.assert_array_equal(gaussian[name][:], plain[name][:], err_msg=name)
+    assert whole.smoothed is whole.smoothed_errors is whole.smoothing is None
+    assert whole.attributes == gaussian.attributes
+    for name in whole.arrays:
+        np.testing.assert_array_equal(gaussian[name][:], whole[name][:], err_msg=name)
     for name in NAMES:
         for numbers in (gaussian.smoothed[name], gaussian.smoothed_errors[name]):
             np.testing.assert_array_equal(np.isfinite(numbers), MASK)

@@ -55,22 +55,19 @@ def metal(alpha):
     return lj.Stack([], lj.Conductor(0.2, 3.0, alpha))
 
 
-def fitted(alpha, step=1.0, instrument=None):
-    geometry = fits.slices([30.0], np.arange(-80.0, 80.5, step))
-    data = fits.simulate(metal(alpha), geometry, SINGLE, 0.02, 1e-4)
-    if instrument is not None:
-        seen = mean_over_cones(metal(alpha), geometry.wi, geometry.wo, 0.0, instrument.detector_aperture)
-        data = replace(data, values=seen * data.values / lj.evaluate(metal(alpha), geometry.wi, geometry.wo, SINGLE))
-    free = metal(fits.Free(0.1, 1e-3, 1.0, fits.LogUniform()))
-    return fits.fit(free, data, transport=SINGLE, starts=4, instrument=instrument)
-
-
 @pytest.mark.parametrize(
     ("alpha", "step", "detector", "limited"),
     [(0.1, 1.0, 0.0, False), (0.1, 10.0, 0.0, True), (0.005, 0.5, 4.0, True)],
 )
 def test_a_lobe_narrower_than_steps_or_aperture_is_limited(alpha, step, detector, limited):
-    found = fitted(alpha, step, fits.Instrument(detector_aperture=detector) if detector else None)
+    geometry, instrument = fits.slices([30.0], np.arange(-80.0, 80.5, step)), None
+    data = fits.simulate(metal(alpha), geometry, SINGLE, 0.02, 1e-4)
+    if detector:
+        instrument = fits.Instrument(detector_aperture=detector)
+        seen = mean_over_cones(metal(alpha), geometry.wi, geometry.wo, 0.0, detector)
+        data = replace(data, values=seen * data.values / lj.evaluate(metal(alpha), geometry.wi, geometry.wo, SINGLE))
+    free = metal(fits.Free(0.1, 1e-3, 1.0, fits.LogUniform()))
+    found = fits.fit(free, data, transport=SINGLE, starts=4, instrument=instrument)
     limits = instrument_limits(found)
     assert bool(limits) == limited
     assert ("base.alpha is limited by the instrument" in verdicts.verdict(found).sentences[2]) == limited

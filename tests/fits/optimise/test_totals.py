@@ -206,21 +206,14 @@ def test_refused(make, message: str) -> None:
 WITHIN = 0.02  # what is asked of coefficients, relative to iad's
 G = 0.9
 TWO_BEAMS = """\
-IAD1
-1.41  # Index of refraction of sample
-1.00  # Index of refraction of slides
-2.65  # [mm] Thickness of sample
-0     # [mm] Thickness of slides
-10    # [mm] Diameter of illumination beam
-0.98  # Reflectance of calibration standard
-1     # Number of spheres
-100 21.8 18.3 8 0.98
-100 18.3 0 8 0.98
+IAD1 1.41 1.00  # indices of refraction of sample and slides
+2.65 0 10 0.98  # [mm] thickness of sample and slides, diameter of beam; standard
+1 100 21.8 18.3 8 0.98 100 18.3 0 8 0.98  # spheres
 # Measurements made by Anisha Bahl at King's College of a PDMS
 # without glass slides using a dual beam spectrometer
 # Process this file as 'iad -X -i 8 -g 0.9 filename'
- L      r         t         n
-600.0  0.64189   0.17381   1.42970
+L r t n
+600.0 0.64189 0.17381 1.42970
 """
 """A row of `docs/phantom_with_no_slides.rxt` of github.com/scottprahl/iad, of which iad makes mu_s' 2.9135 and mu_a
 0.0195 per mm; by spheres as the header describes them mu_s' would be 4.05."""

@@ -139,14 +139,6 @@ def product(stack, wi, wo):
     return (stack["a"] * stack["b"] + 0.0 * wo[:, 2])[:, None]
 
 
-def fit_of_noise(transport: Any, free: dict[str, Free], truth: dict[str, float]) -> Fit:
-    """To measurements whose noise is 0.1."""
-    at = slices([10.0, 50.0], np.arange(-75.0, 76.0, 10.0))
-    exact = np.asarray(transport(truth, at.wi, at.wo))
-    data = along(at, exact + 0.1 * np.random.default_rng(0).standard_normal(exact.shape), 0.1)
-    return fit(free, data, transport=transport, noise=Noise(discrepancy=False), starts=2)
-
-
 @pytest.mark.parametrize(
     ("transport", "free", "truth"),
     [
@@ -157,7 +149,10 @@ def fit_of_noise(transport: Any, free: dict[str, Free], truth: dict[str, float])
 )
 def test_evidence_is_the_integral_over_the_box(transport: Any, free: dict[str, Free], truth: dict[str, float]) -> None:
     """Of posteriors that are no ellipsoids, beside quadrature; the noise is so large that the box matters."""
-    sigma, count, one = 0.1, 1500, fit_of_noise(transport, free, truth)
+    sigma, count, at = 0.1, 1500, slices([10.0, 50.0], np.arange(-75.0, 76.0, 10.0))
+    exact = np.asarray(transport(truth, at.wi, at.wo))
+    data = along(at, exact + sigma * np.random.default_rng(0).standard_normal(exact.shape), sigma)
+    one = fit(free, data, transport=transport, noise=Noise(discrepancy=False), starts=2)
     sides = [np.linspace(low, high, count + 1) for low, high in zip(one.problem.low, one.problem.high, strict=True)]
     a, b = np.meshgrid(*(0.5 * (side[1:] + side[:-1]) for side in sides), indexing="ij")
     # both are linear in two numbers: squares of the residuals by their moments
