@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from fits._files import write_text
 from fits.store import Store, differences, fingerprint
 from tests.helpers.files import contents, largest_file, read_only
 from tests.helpers.tasks import started
@@ -234,3 +235,10 @@ def test_a_fingerprint_tells_problems_apart(one, other):
     assert fingerprint(part=one) == fingerprint(part=one)
     here, there = object(), object()  # both at once, so that they differ in place, as they do in other processes
     assert fingerprint(part=here) == fingerprint(part=there)
+
+
+def test_files_are_written_without_touching_the_umask_that_other_threads_share(tmp_path, monkeypatch):
+    (tmp_path / "plain").touch()
+    monkeypatch.setattr(os, "umask", lambda mode: pytest.fail("the umask is set"))
+    write_text(tmp_path / "own", "text")
+    assert (tmp_path / "own").stat().st_mode == (tmp_path / "plain").stat().st_mode

@@ -113,20 +113,22 @@ def text(words: str) -> Callable[[Path], bytes]:
     return lambda folder: words.encode()
 
 
-FILES: dict[str, tuple[str, Callable[[Path], bytes]]] = {
-    "csv": ("x.csv", csv),
-    "totals": ("x.csv", totals),
-    "rxt": ("x.rxt", text(RXT.format(spheres=1) + "2\n800 0.3 0.4\n810 0.2 0.5\n")),
-    "merl": ("x.binary", merl),
-    "rgl": ("x.bsdf", exported("rgl", ".bsdf")),
-    "zemax": ("x.bsdf", lambda folder: (COATINGS / "AnoBlackNiTEonSteel.bsdf").read_bytes()),
-    "fred": ("x.txt", lambda folder: (COATINGS / "AnoBlackNiTEonSteel.txt").read_bytes()),
-    "klems": ("x.xml", exported("klems", ".xml")),
-    "tensortree": ("x.xml", text(XML.replace("TREE", TREE))),
-    "astm": ("x.astm", text(ASTM)),
-    "pab": ("x.dat", text(PAB)),
-    "alta": ("x.alta", text(ALTA)),
-    "speos": ("x.anisotropicbsdf", text(SPEOS)),
-    "ssdd": ("x.ssdd", text(SSDD)),
-    "lighttools": ("x.bsdf", text(LIGHTTOOLS)),
+FILES: dict[str, Callable[[Path], bytes]] = {
+    "csv": csv,
+    "totals": totals,
+    "rxt": text(RXT.format(spheres=1) + "2\n800 0.3 0.4\n810 0.2 0.5\n"),
+    "merl": merl,
+    "rgl": exported("rgl", ".bsdf"),
+    "zemax": lambda folder: (COATINGS / "AnoBlackNiTEonSteel.bsdf").read_bytes(),
+    "fred": lambda folder: (COATINGS / "AnoBlackNiTEonSteel.txt").read_bytes(),
+    "klems": exported("klems", ".xml"),
+    "tensortree": text(XML.replace("TREE", TREE)),
+    "astm": text(ASTM),
+    "pab": text(PAB),
+    "alta": text(ALTA),
+    "speos": text(SPEOS),
+    "ssdd": text(SSDD),
+    "lighttools": text(LIGHTTOOLS),
 }
+NAMES = {"merl": "x.binary", "rxt": "x.rxt"}
+"""Of files that are known by the ends of their names; all others by their content."""

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fits import Fit, Free, Measurements, Noise, Problem, fit
+from fits import Discrepancy, Fit, Free, Measurements, Noise, Problem, fit, slices
 from fits.data.geometry import Pairs
 
 
@@ -52,11 +52,20 @@ def design(count: int) -> np.ndarray:
     return np.stack([np.ones(count), directions(count, 2)[:, 2]], axis=-1)
 
 
-def drawn_discrepancy(problem: Problem, vector: ArrayLike, generator: np.random.Generator) -> np.ndarray:
-    """A draw of the model discrepancy of the logarithms of a problem's data, (N, 1), with these parameters."""
+SCANS = slices([10.0, 30.0, 50.0, 70.0], np.arange(-80.0, 81.0, 4.0))
+POSITIVE_LINE = {"a": Free(0.9, 0.1, 3.0), "b": Free(0.1, -1.0, 3.0)}
+
+
+def wrong_line(seed: int, discrepancy: Discrepancy, sigma: float = 0.02) -> Measurements:
+    """Readings of a line along SCANS as the noise model says: a smooth discrepancy of the logarithm, and noise."""
+    generator = np.random.default_rng(seed)
+    exact = np.asarray(line({"a": 1.0, "b": 0.5}, SCANS.wi, SCANS.wo))
+    noise = Noise(relative=sigma, floor=1e-4, discrepancy=discrepancy)
+    problem = Problem(POSITIVE_LINE, along(SCANS), line, noise)
     process = problem.model.process
     white = generator.standard_normal((1, len(process.where)))
-    return np.asarray(process.sample(white, problem.build(vector).correlation))
+    drawn = np.asarray(process.sample(white, problem.build([1.0, 0.5]).correlation))
+    return along(SCANS, exact * np.exp(drawn) * (1.0 + sigma * generator.standard_normal(exact.shape)))
 
 
 COUNT = 100
@@ -64,10 +73,10 @@ LINE = {"a": Free(0.9, -1.0, 3.0), "b": Free(0.1, -1.0, 3.0)}
 TRUTH = np.array([1.0, 0.5])
 
 
-def line_data(sigma: float = 0.05, seed: int = 0) -> Measurements:
-    """COUNT readings of the line with the parameters TRUTH, with noise."""
+def line_data(sigma: float = 0.05, seed: int = 0, truth: ArrayLike = TRUTH) -> Measurements:
+    """COUNT readings of the line with these parameters, with noise."""
     noise = np.random.default_rng(seed).standard_normal((COUNT, 1))
-    return measured((design(COUNT) @ TRUTH)[:, None] + sigma * noise, sigma)
+    return measured((design(COUNT) @ truth)[:, None] + sigma * noise, sigma)
 
 
 def line_fit(seed: int = 0) -> Fit:

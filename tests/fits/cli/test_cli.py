@@ -13,11 +13,12 @@ import numpy as np
 import pytest
 
 import layerjax as lj
-from fits import Problem, load_fit, load_posterior, read, save_fit, slices
+from fits import Problem, load_fit, load_posterior, progress, read, save_fit, slices
 from fits.cli import commands
 from fits.cli.arguments import COMMANDS
 from fits.cli.parser import main
 from fits.engines import run
+from fits.progress import show_progress
 from fits.reports.html import FitReport
 from tests.helpers import tasks
 from tests.helpers.coats import make_folder
@@ -170,18 +171,24 @@ def test_convert_and_simulate_write_csv(work, coat_data, layerjax):
 
 
 HELP = """
-import contextlib, sys
+import contextlib, os, sys
 from fits.cli import main
 from fits.cli.arguments import COMMANDS
+from fits.cli.input_output import use_jax
 for words in ([], *([name] for name in COMMANDS)):
     with contextlib.suppress(SystemExit):
         main([*words, "--help"])
+import fits.data.formats
 assert "jax" not in sys.modules
+use_jax()
+assert os.environ["TF_CPP_MIN_LOG_LEVEL"] == "3"  # XLA reads what it may print as it is loaded: it is told before
 """
 
 
-def test_every_command_has_its_help_without_jax() -> None:
-    done = subprocess.run([sys.executable, "-c", HELP], cwd=ROOT, capture_output=True, text=True, check=False)
+def test_help_and_reading_need_no_jax_whose_alarms_are_not_shown() -> None:
+    environment = {name: word for name, word in os.environ.items() if name != "TF_CPP_MIN_LOG_LEVEL"}
+    words = [sys.executable, "-c", HELP]
+    done = subprocess.run(words, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stderr) == (0, "")
     flags = [flag for one in COMMANDS.values() for flag in (*one.particular, *one.shared.split())]
     assert all(flag in done.stdout for flag in flags)
@@ -217,9 +224,19 @@ def test_a_fit_of_angles_in_radians_is_doubted(layerjax, work):
     assert "layerjax: warning: Angles: none is above 0.5°: are they radians?" in said
 
 
-def test_alarms_of_the_compiler_are_not_shown():
-    """XLA reads what it may print as it is loaded: it is told before."""
-    script = "import os, sys; from fits.cli.input_output import use_jax; assert 'jax' not in sys.modules; use_jax(); "
-    script += "assert os.environ['TF_CPP_MIN_LOG_LEVEL'] == '3'"
-    environment = {name: word for name, word in os.environ.items() if name != "TF_CPP_MIN_LOG_LEVEL"}
-    subprocess.run([sys.executable, "-c", script], env=environment, check=True)
+def test_the_first_step_does_not_count_once_there_are_others(monkeypatch):
+    clock = [0.0]
+    monkeypatch.setattr(progress.time, "monotonic", lambda: clock[0])
+    stream = io.StringIO()
+    with show_progress(stream) as told:
+        # taken up again at 10 of 40; the first step compiles for 100 s, others take 20 s each
+        for done, at in ((10, 0.0), (11, 100.0), (12, 120.0), (13, 140.0), (40, 680.0)):
+            clock[0] = at
+            told("map", done, 40, "fine")
+    assert stream.getvalue().splitlines() == [
+        "layerjax: map 10/40 (fine)",
+        "layerjax: map 11/40 (about 48 min left; fine)",
+        "layerjax: map 12/40 (about 9 min left; fine)",
+        "layerjax: map 13/40 (about 9 min left; fine)",
+        "layerjax: map 40/40 (fine)",
+    ]

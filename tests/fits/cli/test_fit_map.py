@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 import layerjax as lj
-from fits import MapOptions, Noise, SpatialPrior, open_map, slices
+from fits import MapOptions, Noise, SpatialPrior
 from fits.cli.parser import main
 from fits.maps.store import FLAGS
 from tests.helpers.commands import refused
-from tests.helpers.map_files import ANGLES, MASK, SIGMA, VALUES, hdf5_file
+from tests.helpers.map_files import ANGLES, MASK, SIGMA, VALUES
 from tests.helpers.painted_maps import numbers, stored, without
 
 WORDS = ["fit-map", "map.npy", "--geometry", "view.csv", "--stack", "coat.toml", "--out", "coat.zarr"]
@@ -81,25 +81,6 @@ def test_defaults_and_options_arrive(place, run):
     assert given["options"].emulator
 
 
-def test_a_map_is_fitted(place, capsys):
-    thickness, albedo = np.array([[0.5, 0.8, 1.2]]), np.array([[0.3, 0.5, 0.6]])
-    view = slices(incidence=(10.0, 50.0), outgoing=np.arange(-60.0, 61.0, 20.0))
-    stack = lj.Stack([lj.Medium(thickness[..., None], 0.8)], lj.Lambertian(albedo[..., None]))
-    wi, wo = view.wi[:, None, None], view.wo[:, None, None]
-    exact = np.moveaxis(np.asarray(lj.evaluate(stack, wi, wo, lj.SingleScattering())), 0, 2)
-    hdf5_file(place / "map.h5", {"values": exact, "wi": view.wi, "wo": view.wo})
-    words = ["fit-map", "map.h5", "--stack", "coat.toml", "--out", "coat.zarr", "--noise", "0.02"]
-    words += ["--processes", "1", "--pilot-texels", "3", "--starts", "4", "--emulator", "never"]
-    assert main(words) == 0
-    fitted = open_map("coat.zarr")
-    # readings without noise: how near a solver stops to the optimum is far below an error
-    for name, truth in (("layers[0].thickness", thickness), ("base.albedo", albedo)):
-        assert np.all(np.abs(fitted.values[name] - truth) < 0.05 * fitted.errors[name])
-    assert main(words) == 0  # nothing is left to do
-    capsys.readouterr()
-    assert "coat.zarr" in refused([*words, "--seed", "1"], capsys, place)
-
-
 def test_what_was_found_is_printed_and_a_map_that_did_not_converge_is_doubtful(run, capsys):
     assert run()[0] == 0
     output = capsys.readouterr()
@@ -113,16 +94,6 @@ def test_what_was_found_is_printed_and_a_map_that_did_not_converge_is_doubtful(r
         assert run(**state)[0] == 1
 
 
-def test_an_interrupt_says_that_the_store_is_good(place, capsys, monkeypatch):
-    def interrupted(*_, **__):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("fits.maps.fit_map.fit_map", interrupted)
-    assert main(WORDS) == 130
-    last = capsys.readouterr().err.splitlines()[-1]
-    assert last == "layerjax: interrupted: coat.zarr keeps what was fitted; the same command resumes it"
-
-
 @pytest.mark.parametrize(
     ("words", "message"),
     [
@@ -133,7 +104,6 @@ def test_an_interrupt_says_that_the_store_is_good(place, capsys, monkeypatch):
         ("coat.zarr=coat.h5", "coat.h5: a fitted map can be written as .zarr only"),
         ("coat.zarr=file.zarr", "file.zarr: is no store of a fitted map"),
         ("--spatial-prior gaussian", "--spatial-prior needs --spatial-scale"),
-        ("--spatial-prior gaussian --spatial-scale 0", "SpatialPrior.scale is 0.0; it must be a number"),
     ],
 )
 def test_bad_input_is_named(place, capsys, words, message):

@@ -3,13 +3,12 @@
 import signal
 import subprocess
 import sys
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from pathlib import Path
 
-import numpy as np
 import pytest
 
-from fits import load_fit, load_posterior, sample, save_fit
+from fits import save_fit
 from fits.cli.parser import main
 from fits.optimise import multi_start as starts
 from fits.reports.html import FitReport
@@ -21,6 +20,7 @@ from tests.helpers.tasks import started, wait_until
 
 FIT = ["fit", "data.csv", "--stack", "coat.toml", "--out", "result"]
 MANY_STARTS = [*FIT, "--starts", "200"]
+FIT_MAP = ["fit-map", "map.npy", "--geometry", "view.csv", "--stack", "coat.toml", "--out", "coat.zarr"]
 FIT_MANY = ["fit-many", "scans", "--stacks", "bare.toml", "--out", "out", "--starts", "2", "--processes", "1"]
 
 
@@ -33,21 +33,12 @@ def refusal(words, capsys):
     return error
 
 
-@contextmanager
-def stopped(words, when):
-    """A `layerjax` command in a process of its own, held where it is once `when` is true, and killed in the end."""
-    with started(["-m", "fits.cli", *words]) as process:
-        wait_until(lambda: process.poll() is not None or when())
-        assert process.poll() is None, "it ended too soon"
-        process.send_signal(signal.SIGSTOP)
-        yield process
-
-
 @pytest.mark.parametrize(
     ("place", "words", "hint"),
     [
         ("fits.sampling.sample.sample", ["sample", "result"], "the chain is kept, `layerjax sample result` resumes it"),
         ("fits.batch.fit_one", FIT_MANY, "out keeps what was fitted; the same command resumes it"),
+        ("fits.maps.fit_map.fit_map", FIT_MAP, "what was fitted is in coat.zarr; the same command resumes it"),
         ("fits.structure_search.search", ["search", "data.csv", "--out", "out"], "out keeps what was fitted"),
     ],
 )
@@ -127,37 +118,14 @@ def test_a_fit_on_a_full_disk_keeps_its_starts_and_the_earlier_result(work, caps
     assert not list(work.glob(".*"))
 
 
-def test_beside_a_running_sampler_others_only_read(work, capsys, coat_fit, monkeypatch):
-    monkeypatch.setattr(FitReport, "page", lambda _: "drawn")
-    for name in ("result", "other"):
-        save_fit(coat_fit, name)
-    directory, chain = work / "result", work / "result" / "chain.db"
-    words = ["sample", "result", "--walkers", "32", "--ess", "1000"]
-    with stopped(words, lambda: chain.is_file() and chain.stat().st_size > 30_000) as process:
-        before = contents(directory)
-        assert {str(chain), f"{chain}.lock"} < set(before)
-        for other in (words, [*words, "--force"], [*MANY_STARTS, "--force"]):
-            assert f"in use by another process ({process.pid})" in refusal(other, capsys)
-        posterior = load_posterior(directory)
-        assert main(["compare", "result", "other", "--no-refit"]) == 0
-        assert main(["report", "result", "--out", "report.html"]) == 0
-        assert contents(directory) == before
-    assert process.returncode == -signal.SIGKILL
-    assert posterior is not None
-    loaded = load_fit(directory)
-    whole = sample(loaded, walkers=32, seed=0, path=chain, ess=1_000)
-    again = sample(loaded, walkers=32, seed=0, ess=1_000)
-    assert 0 < len(posterior.chain) < len(again.chain)
-    np.testing.assert_array_equal(posterior.chain, again.chain[: len(posterior.chain)])
-    np.testing.assert_array_equal(whole.chain, again.chain)
-    assert not (directory / "chain.db.lock").exists()
-
-
 def test_an_interrupted_fit_exits_with_130_and_the_next_resumes_with_the_starts_that_are_done(
     work, capsys, monkeypatch
 ):
     done = work / ".result.starts"
-    with stopped(MANY_STARTS, lambda: done.is_file() and len(Store.read(done).keys()) > 2) as process:
+    with started(["-m", "fits.cli", *MANY_STARTS]) as process:
+        wait_until(lambda: process.poll() is not None or (done.is_file() and len(Store.read(done).keys()) > 2))
+        assert process.poll() is None, "it ended too soon"
+        process.send_signal(signal.SIGSTOP)
         before = contents(work)
         assert f"result is in use by another process ({process.pid})" in refusal(MANY_STARTS, capsys)
         assert contents(work) == before

@@ -19,7 +19,7 @@ def made(tmp_path_factory):
 
     def of(kind: str) -> bytes:
         if kind not in kept:
-            kept[kind] = FILES[kind][1](folder)
+            kept[kind] = FILES[kind](folder)
         return kept[kind]
 
     return of

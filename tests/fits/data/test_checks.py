@@ -1,4 +1,4 @@
-"""What measurements say of themselves: of data whose answers are known, and of those that are shipped."""
+"""What measurements say of themselves: of data whose answers are known."""
 
 from dataclasses import replace
 from itertools import combinations
@@ -9,7 +9,6 @@ import pytest
 import fits
 from fits.reports.data_summary import data_statements, energies, reciprocity, repeats, sides
 from tests.helpers.models import along
-from tests.helpers.places import COATINGS
 
 ANGLES = [10.0, 30.0, 50.0, 70.0]
 HEMISPHERE = fits.slices(ANGLES, np.arange(-85.0, 86.0, 5.0), np.arange(0.0, 180.0, 10.0))
@@ -60,13 +59,6 @@ def test_repeats_tell_the_noise() -> None:
     # the median of |x - y| is 0.6745 sqrt(2) sigma, known to some percent
     assert found.median == pytest.approx(0.6745 * np.sqrt(2.0) * 0.02, rel=0.1)
     assert "a noise of about 2" in data_statements(twice)[-1]
-
-
-def test_the_shipped_coatings_are_reciprocal_and_dark() -> None:
-    steel = fits.read(COATINGS / "nite_on_blasted_steel1008_650nm_hemisphere.csv")
-    assert 0.01 < reciprocity(steel).median < 0.05
-    assert all(0.06 < one.share[0] / one.covered < 0.11 for one in energies(steel))
-    assert statement(steel, "Sides") == statement(steel, "Angles") == ""
 
 
 def test_a_peak_on_the_side_of_the_light_is_told_of() -> None:

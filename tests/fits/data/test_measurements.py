@@ -1,8 +1,5 @@
 """Measurements: validation, conversion at the door, masks; and the geometry they are taken in."""
 
-import subprocess
-import sys
-
 import numpy as np
 import pytest
 
@@ -94,8 +91,3 @@ def test_slices_are_where_they_say():
     ):
         with pytest.raises(ValueError, match=message):
             slices(**arguments)
-
-
-def test_reading_needs_no_jax():
-    code = "import sys, fits.data.formats; sys.exit('jax' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -17,7 +17,6 @@ SLAB = RXT.format(spheres=0)
 WHOLE = {
     "csv": {
         "": "the file is empty",
-        " \n\n": "the file is empty",
         "# nothing else\n": "the file holds only comments",
         HEAD: "line 1: no samples below the header",
         "theta_i,phi_i,phi_o,brdf\n1,2,3,4": "line 1: no column 'theta_o', the file has theta_i, phi_i, phi_o, brdf",
@@ -31,7 +30,6 @@ WHOLE = {
         "theta_i,theta_o,brdf_a,brdf_b,brdf_a_std\n1,2,3,4,5\n1,2,3,4,": "'b' has no standard deviation to estimate",
         f"{HEAD}{GOOD}\n10,180,20,0,abc": "line 3, column 'brdf': 'abc' is not a number, must be a finite",
         f"{HEAD}\n# x\n\n,180,20,0,1": "line 4, column 'theta_i': '' is not a number",
-        f"{HEAD}\n10,180,nan,0,1": "line 2, column 'theta_o': nan is not allowed, must be a number in",
         f"{HEAD}\n10,180,20,0,\n10,180,25,0,NaN": "line 1: no data point below holds a number in column brdf",
         f"{HEAD}\n10,180,20,0,1e300": r"line 2, column 'brdf': 1e300 is not allowed, .*at most 1e\+30 in size",
         f"{HEAD},brdf_std\n10,180,20,0,1,1e-200": "line 2, column 'brdf_std': 1e-200 is not allowed, must be > 0",
@@ -60,7 +58,6 @@ WHOLE = {
         "type bsdf_data": "must be followed by a line 'format",
         "theta_i": "a FRED table starts with 'type bsdf_data', found 'theta_i'",
         FRED.replace("scale=1", "angles=sin"): "line 2: 'angles=sin' is not supported",
-        FRED.replace("scale=1", "bsdf=log"): "line 2: 'bsdf=log' is not supported",
         FRED.replace("scale=1", "scale=x"): "line 2, column 'scale': 'x' is not a number",
         FRED: "no samples",
         f"{FRED}1 2 3": "line 3: a scatter direction before any specular",
@@ -84,7 +81,6 @@ WHOLE = {
         f"{SLAB}r S\n0.3 0\n0.3 1": "the number of spheres varies",
         f"{SLAB}L r n\n800 0.3 1.3\n900 0.3 1.5": "n, the index of the sample, goes from 1.3 to 1.5, and one slab",
         f"{RXT.format(spheres=3)}1\n0.3": "number of spheres is 3, must be 0, 1 or 2",
-        f"{RXT.format(spheres=1.5)}1\n0.3": "number of spheres is 1.5",
         f"{RXT.format(spheres=2)}1\n0.3".replace(
             "25", "225"
         ): r"Sphere.sample is 225.0, must be a number in \[0, 200\)",
@@ -92,7 +88,6 @@ WHOLE = {
     "astm": {"DATE 4/8/98\n": "no line 'VARS theta_i,phi_i,theta_s,phi_s,...' that names the columns"},
     "alta": {
         "#DIM 1 1\n#PARAM_IN COS_TH\n#PARAM_OUT INV_STERADIAN\n1.8 3": "none of the 1 sample has directions",
-        "#DIM 1 1\n#PARAM_IN COS_TH\n0.8 3": "no PARAM_OUT: the header does not say what the values are: give quantity",
         "#DIM 1 3\n#PARAM_IN COS_TH\n#PARAM_OUT RGB_COLOR\n0.9 1 2 3": "RGB_COLOR does not say what the values are",
     },
     "rgl": {
@@ -126,7 +121,6 @@ CHANGED = {
     ],
     "pab": [
         ("DSF", "energy", "line 2: format is 'theta phi energy'"),
-        ("theta phi DSF", "theta phi", "line 2: format is 'theta phi'"),
         ("#incident_angle 30 180\n", "", "no #incident_angle, nor #intheta and #inphi"),
         ("30 180", "30", "line 1: incident_angle must be followed by theta and phi, found 1 word"),
         ("30 180", "200 180", "line 1, column 'theta': 200 is not allowed"),
@@ -138,7 +132,6 @@ CHANGED = {
         ("RUSIN_TH_TD_PD", "STARK_3D", "line 2: PARAM_IN is 'STARK_3D', must be one of RUSIN_TH_PH_TD_PD"),
         ("INV_STERADIAN", "WATTS", "line 3: PARAM_OUT is 'WATTS'"),
         ("INV_STERADIAN", "RGB_COLOR", "line 3: RGB_COLOR has 3 columns, DIM says 1"),
-        ("INV_STERADIAN", "UNKNOWN", "PARAM_OUT UNKNOWN does not say what the values are: give quantity"),
         ("#PARAM_IN", "#FROM", "the header has no line '#PARAM_IN ...'"),
         ("#DIM 3 1", "#DIM 2 1", "line 1: 2 columns of RUSIN_TH_TD_PD, must be 3"),
         ("#DIM 3 1", "#DIM 3", "line 1: DIM must be followed by two numbers, found 1"),
@@ -160,7 +153,6 @@ CHANGED = {
         ("PARAM2_LIST 0 20\n", "", "line 7: the header of this brdf has no PARAM2_LIST"),
         ("0_LIST 10 40", "0_LIST 10 40 50", "the file ends where 12 lines of data are expected"),
         ("0.3\n0.1", "0.3 1\n0.1", "line 9: 4 numbers, must be 3"),
-        ("DATA ascii\n", "", "line 8: unknown entry '0.1'"),
         ("PARAM3_LIST", "PARAM9_LIST", "line 7: unknown entry 'PARAM9_LIST'"),
         ("DATA ascii\n" + "0.1 0.2 0.3\n" * 8, "", "the file ends where DATA is expected"),
         ("DATA ascii", "DATA hex", "line 8: DATA is 'hex', must be ascii or binary"),

@@ -1,4 +1,4 @@
-"""SSDD files: the example of its specification, all coordinates, blocks, colours and binary numbers."""
+"""SSDD files: all coordinates, blocks, colours and binary numbers."""
 
 import numpy as np
 import pytest
@@ -22,16 +22,8 @@ def block(kind="brdf", system="spherical", more="", colour="monochrome", mode="a
     return BLOCK.format(**said, incidences=incidences)
 
 
-def test_the_example_of_the_specification(reading):
-    lists = "PARAM0_LIST 0\nPARAM2_LIST 0\nPARAM3_LIST 0\n"
-    head = "DATA_TYPE brdf\nCOLOR_MODEL monochrome\nPARAM_TYPE spherical_coordinate_system\n"
-    data = reading(f"VERSION 0.2\n\n{head}{lists}DATA ascii\n0.3183\n")
-    assert data.source.format == "ssdd"
-    np.testing.assert_array_equal(data.values, [[0.3183]])
-
-
 def test_spherical(reading):
-    data = reading(f"VERSION 0.3\n{block()}# a comment\n{NUMBERS}")
+    data = reading(f"VERSION 0.2\n\n{block()}# a comment\n{NUMBERS}")
     number = {float(value): row for row, value in enumerate(data.values[:, 0])}
     np.testing.assert_allclose(data.wi[number[1]], direction(40, 0), atol=1e-15)
     outgoing = [data.wo[number[value]] for value in (2, 8, 17)]

@@ -1,129 +1,192 @@
-"""Tables of text by hand, ASTM, pab, LightTools and FRED: angles, sides, colours and quantities."""
+"""Texts by hand of ASTM, pab, LightTools, FRED and Zemax: rows of angles and values, channels, quantities and notes."""
 
 import numpy as np
 import pytest
 
-from fits.data.geometry import direction
+from fits.data.geometry import azimuth, direction, polar
 from fits.data.reading import read
+from tests.helpers.data_files import LIGHTTOOLS, ZEMAX
 from tests.helpers.places import COATINGS
 
 ASTM = "ASTM 1\nDATE 4/8/1998\nSAMPLE Paint, blue\nNUM_POINTS 2\nVARS theta_i,phi_i,theta_s,phi_s,R,G,B\n"
+PAB = """#sample_name "a sample"
+#incident_angle 82.5 180
+#format: theta phi DSF
+84.968 125.790 0.009744
+84.889 125.610 -0.007737
+"""
+PAB_ROWS = [
+    (82.5, 180, theta, phi, value / np.cos(np.radians(theta)))
+    for theta, phi, value in ((84.968, 125.79, 0.009744), (84.889, 125.61, -0.007737))
+]
+LIT = "azimuths about the normal"
+SKIPPED = "ScatterRadial and|skipped: 0 grid points at|masked: 1 zero above the horizon, not measured"
+BLOCK = ZEMAX[ZEMAX.index("TIS") : ZEMAX.index("DataEnd")]
 
 
-def test_astm_in_radians(reading):
-    data = reading(f"{ASTM}0.5,3.14159265,0.25,0.1,0.1,0.2,0.3\n\n0.5,1,-0.25,6.2,0.4,0.5,-0.01\n")
-    assert data.channels == ("red", "green", "blue")
-    half, quarter, first, second = np.degrees([0.5, 0.25, 0.1, 6.2])
-    np.testing.assert_allclose(data.wi, direction(half, [180, np.degrees(1)]), atol=1e-8)
-    np.testing.assert_allclose(data.wo, direction(quarter, [first, second + 180]), atol=1e-12)
-    np.testing.assert_array_equal(data.values, [[0.1, 0.2, 0.3], [0.4, 0.5, -0.01]])
-    assert data.source.notes == ("angles taken as radians", "1 sample below zero, kept as measured")
+def lighttools(*tables, spectrum="Monochrome"):
+    """A file of tables, each the usual one but for some words."""
+    head, table = LIGHTTOOLS.removesuffix("DataEnd\n").replace("Monochrome", spectrum).split("DataBegin\n")
+    return f"LightTools BSDF\n# a comment\n{head}DataBegin\n{''.join(changed(table, *one) for one in tables)}DataEnd\n"
 
 
-def test_astm_in_degrees_with_blanks_and_wavelengths(reading):
-    text = "VARS theta_i phi_i theta_s phi_s 550nm 650nm\n30 180 40 0 0.1 0.2\n30 180 120 0 0.1 0.2\n"
-    data = reading(text, quantity="brdf_cos")
-    assert data.channels == ("550 nm", "650 nm")
-    np.testing.assert_allclose(data.theta_o, [40, 120])
-    np.testing.assert_allclose(data.values[:, 0], [0.1 / np.cos(np.radians(40)), 0.1 / 0.5])
-    assert data.source.notes[0].startswith("angles taken as degrees")
+def lit(theta_i=20, phi_i=90, first=1, turned=0):
+    """Rows of such a table: outgoing angles about the normal, which counts once."""
+    outgoing = ((0, 0, first), (30, 0, 2), (30, 90, 4), (30, 180, 6))
+    return [(theta_i, phi_i, abs(turned - theta), phi, value) for theta, phi, value in outgoing]
 
 
-def test_astm_without_azimuth_of_the_light(reading):
-    data = reading("VARS theta_i,theta_s,phi_s,Integrated BRDF\n0.3,0.3,0,0.7\n")
-    np.testing.assert_allclose(data.wi * [-1, 1, 1], data.wo, atol=1e-15)
-    assert data.channels == ("value",)
+def changed(text, *changes):
+    for old, new in changes:
+        assert old in text
+        text = text.replace(old, new)
+    return text
+
+
+def about_specular(theta, *values, phi_i=180.0, below=0, turns=(0, 90, 180)):
+    """Rows of Zemax: the specular direction once, and 25 degrees away, at azimuths from where the normal lies."""
+    rows = [(theta, phi_i, theta, phi_i + 180.0, values[0])]
+    for turn, value in zip(np.radians(turns), values[1:], strict=True):
+        # in a frame of the specular direction, the direction towards the normal, and sideways
+        away = np.cos(np.radians(25)) * direction(theta, 0) + np.sin(np.radians(25)) * (
+            np.cos(turn) * direction(theta - 90.0, 0) - np.sin(turn) * np.array([0, 1, 0])
+        )
+        rows.append((theta, phi_i, polar(away), azimuth(away) + phi_i + 180.0, value))
+    return [(*row[:2], abs(below - row[2]), *row[3:]) for row in rows]
+
+
+SIDES = [[("Front", side), ("BRDF", kind)] for side in ("Front", "Back") for kind in ("BRDF", "BTDF")]
+COLOURS = [
+    [("Wavelength 550", f"TristimulusValue Tris{name}"), ("1 2", f"{first} 2")]
+    for name, first in (("Y", 8), ("X", 7), ("Z", 9))
+]
+XYZ = "".join(f"Tristimulus{name}\nDataBegin\n{BLOCK}DataEnd\n" for name in "XYZ")
+TURNED = [("1\n0\n", "2\n0 30\n"), ("0 90 180", "0 120 240"), (BLOCK, BLOCK * 2)]
+PLAIN = about_specular(20, 1, 2, 3, 4) + about_specular(60, 5, 6, 0, 8)
+
+
+def three(rows, factor=1.0):
+    return [(*row[:4], *[factor * row[4]] * 3) for row in rows]
+
+
+def case(text, rows, channels="value", notes="", masked=(), **options):
+    """notes: how each of them begins."""
+    return text, rows, channels.split(","), notes.split("|") if notes else [], masked, options
+
+
+TABLES = {
+    "astm": case(
+        f"{ASTM}0.5,3.14159265,0.25,0.1,0.1,0.2,0.3\n\n0.5,1,-0.25,6.2,0.4,0.5,-0.01\n",
+        [
+            (*np.degrees([0.5, np.pi, 0.25, 0.1]), 0.1, 0.2, 0.3),
+            (*np.degrees([0.5, 1, -0.25, 6.2]), 0.4, 0.5, -0.01),
+        ],
+        "red,green,blue",
+        "angles taken as radians|1 sample below zero, kept as measured",
+    ),
+    "astm in degrees": case(
+        "VARS theta_i phi_i theta_s phi_s 550nm 650nm\n30 180 40 0 0.1 0.2\n30 180 120 0 0.1 0.2\n",
+        [(30, 180, theta, 0, *np.array([0.1, 0.2]) / abs(np.cos(np.radians(theta)))) for theta in (40, 120)],
+        "550 nm,650 nm",
+        "angles taken as degrees",
+        quantity="brdf_cos",
+    ),
+    "astm without azimuth of the light": case(
+        "VARS theta_i,theta_s,phi_s,Integrated BRDF\n0.3,0.3,0,0.7\n",
+        [(np.degrees(0.3), 180, np.degrees(0.3), 0, 0.7)],
+        notes="angles taken as radians|no phi_i",
+    ),
+    "pab": case(PAB, PAB_ROWS, notes="light at|1 sample below zero, kept as measured"),  # as in the manual of Radiance
+    "pab, angles apart": case(
+        PAB.replace("#incident_angle 82.5 180", "#intheta 82.5\n#inphi 180\n#upphi 90\n#colorimetry: CIE-Y"),
+        PAB_ROWS,
+        notes="light at|1 sample below zero|the sample's up is at phi 90",
+    ),
+    "pab of a BTDF": case(
+        "#format: theta phi BTDF\n#incident_angle 20 0\n#colorimetry: CIE-XYZ\n150 180 1 2 3\n90 0 1 1 1\n",
+        [(20, 0, 150, 180, 1, 2, 3), (20, 0, 90, 0, 1, 1, 1)],
+        "X,Y,Z",
+        "light at|masked: 1 sample in",
+        masked=[1],
+    ),
+    "lighttools": case(lighttools([], [("AOI 20", "AOI 60"), ("1 2", "7 2")]), lit() + lit(60, first=7), notes=LIT),
+    "lighttools, sides": case(
+        lighttools(*SIDES), [*lit(), *lit(turned=180), *lit(160, turned=180), *lit(160)], notes=LIT
+    ),
+    "lighttools, colours in any order": case(
+        lighttools(*COLOURS, spectrum="XYZ"),
+        [(*row[:4], *np.array((7, 8, 9) if row[2] == 0 else [row[4]] * 3) / np.pi) for row in lit()],
+        "X,Y,Z",
+        LIT,
+        quantity="reflectance_factor",
+    ),
+    "fred": case(
+        "type bsdf_data\nformat angles=deg bsdf=value scale=2\n15 0\n-30 0 0.1\n30 90 0.2\n0 0\n10 0 0.3\n",
+        [(15, 180, 30, 180, 0.2), (15, 180, 30, 90, 0.4), (0, 180, 10, 0, 0.6)],  # the mirror direction is given
+    ),
+    "zemax": case(ZEMAX, PLAIN, notes=SKIPPED, masked=[6]),
+    "zemax, transmission": case(
+        ZEMAX.replace("BRDF", "BTDF"),  # straight on, towards the lower normal, and past it
+        [
+            *about_specular(20, 1, 2, 3, 4, below=180, turns=(0, -90, 180)),
+            *about_specular(60, 5, 6, 0, 8, below=180, turns=(0, -90, 180)),
+        ],
+        notes=f"{SKIPPED}|BTDF: AngleOfIncidence",
+        masked=[6],
+    ),
+    "zemax in colours": case(
+        changed(ZEMAX, ("Content Monochrome", "Content XYZ"), (ZEMAX[ZEMAX.index("Monochrome\nDataB") :], XYZ)),
+        three(PLAIN, 1 / np.pi),
+        "X,Y,Z",
+        SKIPPED,
+        masked=[6],
+        quantity="reflectance_factor",
+    ),
+    **{
+        f"zemax, {symmetry}": case(  # as they stand: the light turns by the rotation, the lobe with it
+            changed(ZEMAX, ("PlaneSymmetrical", symmetry), *TURNED),
+            [
+                row
+                for phi_i in (180, 150)
+                for theta, *values in ((20, 1, 2, 3, 4), (60, 5, 6, 0, 8))
+                for row in about_specular(theta, *values, phi_i=phi_i, turns=(0, 120, 240))
+            ],
+            notes=f"{SKIPPED.replace('1 zero', '2 zeros')}|SampleRotation and ScatterAzimuth|the sample's x",
+            masked=[6, 14],
+        )
+        for symmetry in ("PlaneSymmetrical", "ASymmetrical", "Asymmetrical4D")
+    },
+}
+
+
+@pytest.mark.parametrize("name", TABLES)
+def test_rows_of_a_file(reading, name):
+    text, rows, channels, notes, masked, options = TABLES[name]
+    data, expected = reading(text, **options), np.array(rows, float)
+    assert data.source.format == name.split()[0].strip(",")
+    assert data.source.quantity == options.get("quantity", "brdf_cos" if text.startswith("#sample") else "brdf")
+    assert list(data.channels) == channels
+    np.testing.assert_allclose(data.wi, direction(*expected[:, :2].T), atol=1e-8)
+    np.testing.assert_allclose(data.wo, direction(*expected[:, 2:4].T), atol=1e-8)
+    used = data.mask
+    np.testing.assert_array_equal(np.flatnonzero(~used), masked)
+    np.testing.assert_allclose(data.values[used], expected[used, 4:], rtol=1e-9)
+    assert all(note.startswith(start) for note, start in zip(data.source.notes, notes, strict=True))
+
+
+def test_directions_below_the_horizon_and_tables_twice_are_no_data(reading):
+    data = reading(ZEMAX.replace("0 25", "0 35"))
+    assert len(data) == 7  # 60 + 35 degrees away from the normal is below
+    assert (data.wo[:, 2] > 0).all()
+    assert "skipped: 1 grid point at or beyond the horizon" in data.source.notes
+    with pytest.raises(ValueError, match="line 19: this table stands twice"):
+        reading(lighttools([], []))
 
 
 def test_many_numbers_of_astm(tmp_path):
     numbers = np.random.default_rng(0).random((20_000, 7))
     np.savetxt(tmp_path / "big.astm", numbers, "%.6f", ",", header=ASTM.strip(), comments="")
     np.testing.assert_allclose(read(tmp_path / "big.astm").values, numbers[:, 4:].round(6))
-
-
-PAB = """#sample_name "a sample"
-#incident_angle 82.5 180
-#format: theta phi DSF
-84.968 125.790 0.009744
-84.889 125.610 0.007737
-84.805 125.427 0.008569
-"""
-
-
-def test_pab_as_in_the_manual_of_radiance(reading):
-    data = reading(PAB)
-    assert (data.source.format, data.source.quantity) == ("pab", "brdf_cos")
-    np.testing.assert_allclose(data.wi, np.tile(direction(82.5, 180), (3, 1)))
-    np.testing.assert_allclose(data.wo[0], direction(84.968, 125.79))
-    np.testing.assert_allclose(data.values[0, 0], 0.009744 / np.cos(np.radians(84.968)))
-    apart = PAB.replace("#incident_angle 82.5 180", "#intheta 82.5\n#inphi 180\n#upphi 90\n#colorimetry: CIE-Y")
-    same = reading(apart)
-    np.testing.assert_array_equal(same.values, data.values)
-    assert "up is at phi 90" in same.source.notes[-1]
-
-
-def test_pab_with_colours_of_a_btdf(reading):
-    data = reading("#format: theta phi BTDF\n#incident_angle 20 0\n#colorimetry: CIE-XYZ\n150 180 1 2 3\n90 0 1 1 1\n")
-    assert data.channels == ("X", "Y", "Z")
-    np.testing.assert_array_equal(data.values[0], [1, 2, 3])
-    assert data.wo[0, 2] < 0
-    np.testing.assert_array_equal(data.mask, [True, False])
-    assert "1 sample below zero, kept as measured" in reading(PAB.replace("0.009744", "-0.01")).source.notes
-
-
-HEAD = """LightTools BSDF
-# a comment
-Symmetry Asymmetric
-SpectralContent {spectrum}
-ScatterAzimuth 3
-0 90 180
-ScatterRadial 2
-0 30
-DataBegin
-"""
-TABLE = "AOI {aoi}\nPOI 0\nSide {side}\nScatterType {kind}\n{more}TIS 0.2\n{first} 1\n{first} 2\n{first} 3\n"
-
-
-def lighttools(*tables, spectrum="Monochrome"):
-    usual = {"aoi": 20, "side": "Front", "kind": "BRDF", "more": "Wavelength 550\n", "first": 5}
-    return HEAD.format(spectrum=spectrum) + "".join(TABLE.format(**usual | table) for table in tables) + "DataEnd\n"
-
-
-def test_lighttools(reading):
-    """Angles about the normal, the light at azimuth 90: the mirror direction is at 270."""
-    data = reading(lighttools({}, {"aoi": 60, "first": 7}))
-    assert data.source.format == "lighttools"
-    np.testing.assert_allclose(data.wi[0], direction(20, 90), atol=1e-15)
-    np.testing.assert_array_equal(data.values[:, 0], [5, 1, 2, 3, 7, 1, 2, 3])  # the normal once
-    np.testing.assert_allclose(data.wo[1:4], direction(30, [0, 90, 180]), atol=1e-15)
-    with pytest.raises(ValueError, match="line 19: this table stands twice"):
-        reading(lighttools({}, {}))
-
-
-def test_sides_of_lighttools(reading):
-    data = reading(
-        lighttools(*({"side": side, "kind": kind} for side in ("Front", "Back") for kind in ("BRDF", "BTDF")))
-    )
-    np.testing.assert_array_equal(np.sign(data.wi[::4, 2]), [1, 1, -1, -1])
-    np.testing.assert_array_equal(np.sign(data.wo[::4, 2]), [1, -1, -1, 1])
-
-
-def test_colours_of_lighttools_in_any_order(reading):
-    tables = [
-        {"more": f"TristimulusValue Tris{name}\n", "first": value} for name, value in (("Y", 2), ("X", 1), ("Z", 3))
-    ]
-    data = reading(lighttools(*tables, spectrum="XYZ"), quantity="reflectance_factor")
-    assert data.channels == ("X", "Y", "Z")
-    np.testing.assert_allclose(data.values[0] * np.pi, [1, 2, 3])
-
-
-def test_fred(reading):
-    text = "type bsdf_data\nformat angles=deg bsdf=value scale=2\n15 0\n-30 0 0.1\n30 90 0.2\n0 0\n10 0 0.3\n"
-    data = reading(text)
-    np.testing.assert_allclose(data.values[:, 0], [0.2, 0.4, 0.6])
-    np.testing.assert_allclose(data.theta_i, [15, 15, 0])
-    np.testing.assert_allclose(data.wo[:2], [direction(30, 180), direction(30, 90)], atol=1e-15)
-    np.testing.assert_allclose(data.phi_i[:2], 180)  # the file gives the mirror direction
 
 
 def test_a_fred_file_is_the_csv_plus_the_laboratory_floor():
@@ -142,3 +205,18 @@ def test_a_fred_file_is_the_csv_plus_the_laboratory_floor():
     assert 7.5e-5 < floor < 7.6e-5
     rounding = 5e-7 + 5e-6 * theirs + 2e-8  # six decimals here, six digits there, and the floor as found
     assert (abs(ours - theirs - floor / cosine) <= rounding).all()
+
+
+def test_a_zemax_file_is_measured_up_to_80_degrees_from_the_normal():
+    """The instrument stopped at theta_o = 80: the file's zeros must lie beyond it, and all its values within.
+
+    Radial angles about the normal, or azimuths counted from the other side, would scatter both over all theta_o.
+    """
+    steel = read(COATINGS / "AnoBlackNiTEonSteel.bsdf")
+    assert (steel.theta_o[steel.mask] <= 80 + 1e-9).all()
+    assert (steel.theta_o[~steel.mask] > 80).all()
+    assert (steel.mask.sum(), (~steel.mask).sum()) == (647, 59)
+    assert sorted(set(steel.theta_i)) == [10, 30, 50, 70]
+    np.testing.assert_allclose(steel.phi_i, 180)
+    mirror = np.linalg.norm(steel.wi * [-1, -1, 1] - steel.wo, axis=1) < 1e-9  # once
+    np.testing.assert_allclose(steel.values[mirror, 0], [6.039e-2, 7.562e-2, 1.601e-1, 1.522], rtol=1e-3)

@@ -145,15 +145,12 @@ def test_a_zemax_file_holds_the_stack(tmp_path, stack, total):
         assert totals[0] == pytest.approx(float(reflected[0]), abs=1e-6)
 
 
-def test_slices_hold_the_stack_on_both_sides(tmp_path):
+def test_slices_hold_the_stack_or_the_best_of_a_fit_on_both_sides(tmp_path, coat_fit):
     path, _ = written(HAZE, tmp_path, "csv", transport=lj.SingleScattering())
     data = fits.read(path)
     assert (data.theta_o > 90).any()
     agrees(data, HAZE, lj.SingleScattering(), 1e-12)
-
-
-def test_a_fit_is_written_by_its_best_values(tmp_path, coat_fit):
-    path, _ = written(coat_fit, tmp_path, "csv")
+    path, _ = written(coat_fit, tmp_path, "csv", force=True)
     agrees(fits.read(path), coat_fit.stack, coat_fit.problem.transport, 1e-12)
 
 

@@ -42,17 +42,6 @@ def values(geometry):
     return exact + sigma * np.random.default_rng(3).standard_normal(exact.shape)
 
 
-@pytest.fixture(scope="module")
-def fitted(geometry, values):
-    """Fits the map."""
-
-    def fit(out, stack, noise=NOISE):
-        options = MapOptions(starts=2, chunk_size=4)
-        return fits.fit_map(stack, geometry, values, out, noise=noise, transport=TRANSPORT, options=options)
-
-    return fit
-
-
 @pytest.mark.parametrize(
     ("prior", "bounds"),
     [(None, (-0.2, 0.8)), (fits.Normal(0.2, 0.05), (-0.2, 0.8)), (None, (-0.2, 0.25))],
@@ -82,7 +71,11 @@ def test_errors_of_what_a_pilot_does_not_know_are_infinite():
         np.testing.assert_allclose(step, [-1e-8 if known else 0.0, 0.0])
 
 
-def test_a_map_holds_what_its_texels_have_in_common(tmp_path, fitted):
+def test_a_map_holds_what_its_texels_have_in_common(tmp_path, geometry, values):
+    def fitted(out, stack, noise=NOISE):
+        options = MapOptions(starts=2, chunk_size=4)
+        return fits.fit_map(stack, geometry, values, out, noise=noise, transport=TRANSPORT, options=options)
+
     map = fitted(tmp_path / "common.zarr", free())
     assert map.names == NAMES
     shared = map.attributes["common"]["layers[0].phase.g"]

@@ -28,19 +28,6 @@ os.replace = slowly
 """
 
 
-def make(folder, shape):
-    """The files of a map in chunks of 16 texels, and the store of an undisturbed run."""
-    write_files(folder, shape)
-    (folder / "sitecustomize.py").write_text(SLOW_DISK)
-    assert main(command(folder, folder / "whole.zarr")) == 0
-    return folder, open_map(folder / "whole.zarr")
-
-
-@pytest.fixture(scope="module")
-def made(tmp_path_factory):
-    return make(tmp_path_factory.mktemp("map"), (16, 16))
-
-
 def chunks_of(store):
     """How many chunks a store has."""
     return sum(1 for path in store.glob("flags/c/*/*") if path.suffix != ".partial")
@@ -60,10 +47,14 @@ def workers_of(process):
 
 
 @pytest.mark.parametrize("kills", [2, pytest.param(50, marks=pytest.mark.slow)])
-def test_killed_at_random_moments(made, tmp_path, kills):
+def test_killed_at_random_moments(tmp_path, kills):
     """The same command repeated until it has been killed so many times, now and then as a whole and else one of its
     workers, after a few chunks each, at any moment."""
-    folder, whole = made if kills == 2 else make(tmp_path, (80, 40))
+    folder = tmp_path
+    write_files(folder, (16, 16) if kills == 2 else (80, 40))  # in chunks of 16 texels
+    (folder / "sitecustomize.py").write_text(SLOW_DISK)
+    assert main(command(folder, folder / "whole.zarr")) == 0
+    whole = open_map(folder / "whole.zarr")
     (tmp_path / "many").mkdir()
     out, chunks = tmp_path / "many" / "coat.zarr", whole.flags.size // 16
     choice, killed, every = random.Random(kills), Counter(), min(5, kills)
@@ -94,28 +85,3 @@ def test_killed_at_random_moments(made, tmp_path, kills):
     assert chunks_of(out) == chunks
     assert_same(open_map(out), whole)
     assert os.listdir(tmp_path / "many") == ["coat.zarr"]
-
-
-@pytest.mark.slow
-def test_one_run_at_a_time_which_the_user_interrupts(made, tmp_path, capsys):
-    folder, whole = made
-    out = tmp_path / "coat.zarr"
-    words = command(folder, out, "--processes", "2")
-    with started([*CLI, *words], folder) as process:
-        wait_until(lambda: chunks_of(out) >= 2)
-        process.send_signal(signal.SIGSTOP)
-        assert main(["report", str(out)]) == 0  # while it runs
-        for more in ([], ["--force"], ["--noise", "0.03", "--force"]):
-            assert main([*words, *more]) == 2
-            assert f"{out} is in use by another process ({process.pid})" in capsys.readouterr().err
-        workers = workers_of(process.pid)
-        process.send_signal(signal.SIGCONT)
-        os.killpg(process.pid, signal.SIGINT)
-        _, error = process.communicate(timeout=PATIENCE)
-    assert process.returncode == 130
-    assert "Traceback" not in error
-    assert error.splitlines()[-1].startswith("layerjax: interrupted: what was fitted is in")
-    assert not any(map(running, workers))
-    assert sorted(os.listdir(tmp_path)) == ["coat.html", "coat.zarr"]
-    assert main(command(folder, out)) == 0
-    assert_same(open_map(out), whole)

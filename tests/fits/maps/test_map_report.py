@@ -11,7 +11,6 @@ import zarr
 from matplotlib.colors import LogNorm
 
 import fits
-from fits.cli.parser import main
 from fits.maps import report
 from fits.maps.report import summarise, verdict
 from fits.maps.store import FLAGS, Store
@@ -178,21 +177,19 @@ def test_maps_in_every_state_are_reported_as_one_whole_file(state, count, words,
         assert one in text, one
 
 
-def test_the_command_writes_the_page_beside_the_store_or_says_why_not(tmp_path, capsys, monkeypatch):
+def test_the_command_writes_the_page_beside_the_store_or_says_why_not(tmp_path, capsys, layerjax, monkeypatch):
     monkeypatch.chdir(tmp_path)
     arrays = numbers((4, 4))
     without(arrays, np.ones((4, 4), bool), "masked")  # one picture only
     map = stored(tmp_path / "a.zarr", arrays, (2, 2))
     with pytest.raises(ValueError, match="reported by itself"):
         fits.report(map, path=tmp_path / "a.html", others={"b": map})
-    assert main(["report", "a.zarr"]) == 0
-    output = capsys.readouterr().out
+    output = layerjax("report a.zarr").out
     assert "No texel is fitted." in output
     assert "Report: a.html" in output
-    assert main(["report", "a.zarr/", "--force"]) == 0
-    assert main(["report", "a.zarr", "--out", "b.html"]) == 0
+    layerjax("report a.zarr/ --force")
+    layerjax("report a.zarr --out b.html")
     assert (tmp_path / "b.html").read_bytes() == (tmp_path / "a.html").read_bytes()
-    capsys.readouterr()
     zarr.create_group(tmp_path / "other.zarr")
     os.truncate(map.path / "flags" / "c" / "0" / "1", 3)
     for words, message in (

@@ -73,26 +73,15 @@ def fitted(measured):
 
 
 @pytest.fixture(scope="module")
-def plain(tmp_path_factory, fitted):
+def whole(tmp_path_factory, fitted):
     return fitted(tmp_path_factory.mktemp("map") / "plain.zarr")
 
 
-@pytest.fixture
-def out(tmp_path, plain):
-    """A copy of its store."""
-    return shutil.copytree(plain.path, tmp_path / "coat.zarr")
-
-
 @pytest.fixture(scope="module")
-def smoothed(tmp_path_factory, plain, fitted):
+def smoothed(tmp_path_factory, whole, fitted):
     """The maps with a spatial prior of each kind."""
     folder = tmp_path_factory.mktemp("map")
-    return {kind: fitted(shutil.copytree(plain.path, folder / kind), spatial_prior=PRIORS[kind]) for kind in PRIORS}
-
-
-@pytest.fixture(scope="module")
-def gaussian(smoothed):
-    return smoothed["gaussian"]
+    return {kind: fitted(shutil.copytree(whole.path, folder / kind), spatial_prior=PRIORS[kind]) for kind in PRIORS}
 
 
 def units_of(values):
@@ -145,11 +134,12 @@ def test_it_ends_where_a_joint_minimisation_does(smoothed, predict, measured, ki
         np.testing.assert_allclose(errors, exact, rtol=0.01)
 
 
-def test_the_plain_fit_stays_and_masked_texels_stay_out(plain, gaussian):
-    assert plain.smoothed is plain.smoothed_errors is plain.smoothing is None
-    assert plain.attributes == gaussian.attributes
-    for name in plain.arrays:
-        np.testing.assert_array_equal(gaussian[name][:], plain[name][:], err_msg=name)
+def test_the_plain_fit_stays_and_masked_texels_stay_out(whole, smoothed):
+    gaussian = smoothed["gaussian"]
+    assert whole.smoothed is whole.smoothed_errors is whole.smoothing is None
+    assert whole.attributes == gaussian.attributes
+    for name in whole.arrays:
+        np.testing.assert_array_equal(gaussian[name][:], whole[name][:], err_msg=name)
     for name in NAMES:
         for numbers in (gaussian.smoothed[name], gaussian.smoothed_errors[name]):
             np.testing.assert_array_equal(np.isfinite(numbers), MASK)
@@ -163,7 +153,7 @@ def test_parameters_that_are_not_named_are_not_smoothed(out, fitted):
     assert rough[ALBEDO] < 0.5 < rough[THICKNESS]
 
 
-def test_a_run_that_was_stopped_is_resumed_to_the_bit(out, fitted, gaussian):
+def test_a_run_that_was_stopped_is_resumed_to_the_bit(out, fitted, smoothed):
     def stop(stage, done, total=None, info=""):
         if stage == "smoothing" and done == 2:
             raise KeyboardInterrupt
@@ -175,7 +165,7 @@ def test_a_run_that_was_stopped_is_resumed_to_the_bit(out, fitted, gaussian):
     (out / "smoothed.partial" / "values").mkdir(parents=True)  # killed in the midst of the next
     rounds = []
     again = fitted(out, spatial_prior=GAUSSIAN, progress=lambda stage, done, *_: rounds.append((stage, done)))
-    assert_same(again, gaussian)
+    assert_same(again, smoothed["gaussian"])
     assert next(done for stage, done in rounds if stage == "smoothing") >= 1  # not begun anew
 
 
@@ -189,10 +179,11 @@ def test_data_that_cannot_be_read_again_are_named(out, monkeypatch, fitted):
         fitted(out, spatial_prior=GAUSSIAN)
 
 
-def test_another_prior_smooths_anew_and_fits_nothing_again(tmp_path, smoothed, fitted, gaussian):
+def test_another_prior_smooths_anew_and_fits_nothing_again(tmp_path, smoothed, fitted):
     out, stages = shutil.copytree(smoothed["total_variation"].path, tmp_path / "again.zarr"), []
     before = {path: path.stat().st_mtime_ns for path in out.glob("values/**/c/*/*")}
-    assert_same(fitted(out, spatial_prior=GAUSSIAN, progress=lambda stage, *_: stages.append(stage)), gaussian)
+    again = fitted(out, spatial_prior=GAUSSIAN, progress=lambda stage, *_: stages.append(stage))
+    assert_same(again, smoothed["gaussian"])
     assert "pilot" not in stages
     assert {path: path.stat().st_mtime_ns for path in before} == before
     stages.clear()

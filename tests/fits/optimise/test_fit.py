@@ -7,23 +7,16 @@ import pytest
 from scipy.optimize import least_squares
 
 import layerjax as lj
-from benchmarks.measuring.repeats import fit_many
 from fits import Direction, FitOptions, Free, LogNormal, LogUniform, Noise, Normal, Problem, fit, simulate, slices
 from fits.optimise.fit import start_points
 from fits.optimise.levenberg_marquardt import COST_TOLERANCE
 from fits.optimise.options import options_from
 from fits.problem.compilation import _program
 from fits.reports import verdicts
-from tests.helpers.models import LINE, LOBE, LOBE_STACK, design, line, line_data, lobe, measured, noisy_lobe
+from tests.helpers.models import COUNT, LINE, LOBE, LOBE_STACK, design, line, line_data, lobe, measured, noisy_lobe
 
-COUNT = 300
 DESIGN = design(COUNT)
 A, B = "['a']", "['b']"
-
-
-def noisy_line(a=1.0, b=0.5, sigma=0.05):
-    noise = np.random.default_rng(0).standard_normal((COUNT, 1))
-    return measured((DESIGN @ [a, b])[:, None] + sigma * noise, sigma)
 
 
 def regression(data, columns=DESIGN):
@@ -66,18 +59,6 @@ def test_the_lobe_fit_is_scipys(lobe_fit):
     assert other.values != lobe_fit.values
 
 
-def test_repeats_scatter_as_their_errors_say():
-    """Pulls of 64 repeats have mean 0 and deviation 1, within 4 standard errors of those: 0.5 and 0.35."""
-    problem = Problem(LOBE_STACK, noisy_lobe(0), lobe)
-    values = np.stack([noisy_lobe(seed).values for seed in range(64)])
-    repeats = fit_many(problem, values, starts=4)
-    truth = np.array([LOBE[name.strip("[']")] for name in problem.names])
-    pulls = (repeats.vectors - truth) / repeats.standard_errors
-    assert repeats.converged.all()
-    assert np.all(np.abs(pulls.mean(axis=0)) < 0.5)
-    assert np.all(np.abs(pulls.std(axis=0) - 1.0) < 0.35)
-
-
 def test_the_gradient_of_the_posterior_agrees_with_differences():
     def value_and_gradient(model, u):
         return jax.value_and_grad(model.log_posterior_unconstrained)(u)
@@ -102,7 +83,7 @@ def test_starts_are_seeded_and_fill_the_box():
 
 def test_a_parameter_beyond_its_bound_is_held_there_and_one_near_it_is_not():
     """a is best at 1.5 but may not exceed 1: b is then the one-parameter regression, with its error."""
-    data = noisy_line(1.5, 0.5)
+    data = line_data(truth=(1.5, 0.5))
     result = fit({"a": Free(0.5, 0.0, 1.0), "b": LINE["b"]}, data, transport=line, starts=4)
     x = DESIGN[:, 1]
     assert result.at_bound == (A,)
@@ -112,8 +93,8 @@ def test_a_parameter_beyond_its_bound_is_held_there_and_one_near_it_is_not():
     assert np.isnan(result.standard_errors[A])
     assert "at a bound: ['a']" in result.status
     # an optimum 1e-4 of the box inside is an interior minimum
-    optimum = regression(noisy_line())
-    near = fit({"a": Free(0.5, -1.0, optimum[0] + 2e-4), "b": LINE["b"]}, noisy_line(), transport=line, starts=4)
+    optimum = regression(line_data())
+    near = fit({"a": Free(0.5, -1.0, optimum[0] + 2e-4), "b": LINE["b"]}, line_data(), transport=line, starts=4)
     assert near.at_bound == ()
     np.testing.assert_allclose(near.vector, optimum, atol=1e-6)
 
@@ -159,7 +140,7 @@ def test_parameters_with_hardly_any_effect_are_not_determined_and_no_error_overf
         return line(stack, wi, wo) + stack["strength"] * (stack["c"] + stack["d"]) * wo[:, :1]
 
     free = {**LINE, "c": Free(0.5, 0.0, 1.0), "d": Free(0.5, 0.0, 1.0), "strength": strength}
-    result = fit(free, noisy_line(), transport=faint, starts=2)
+    result = fit(free, line_data(), transport=faint, starts=2)
     assert result.insensitive == ("['c']", "['d']")
     assert result.standard_errors["['c']"] == np.inf
     assert result.standard_errors[A] == pytest.approx(0.05 * np.sqrt(np.linalg.inv(DESIGN.T @ DESIGN)[0, 0]), rel=1e-6)
@@ -193,7 +174,7 @@ def test_free_noise_levels_are_recovered(tails):
 
 
 def test_student_tails_shrug_off_outliers():
-    spoiled = noisy_line().values.copy()
+    spoiled = line_data().values.copy()
     spoiled[::20] += 3.0
     for tails in ("student", "gaussian"):
         found = fit(LINE, measured(spoiled, 0.05), transport=line, noise=Noise(tails=tails), starts=4)
@@ -203,14 +184,14 @@ def test_student_tails_shrug_off_outliers():
 def test_a_scale_with_its_prior():
     """Only scale times (a, b) is known; the prior on the logarithm decides the scale, and gives its error."""
     scale = Free(1.0, 0.5, 2.0, LogNormal(1.1, 0.05))
-    result = fit(LINE, noisy_line(), transport=line, scale=scale, starts=4)
-    assert result.scale == pytest.approx(1.1, rel=1e-6)
+    result = fit(LINE, line_data(), transport=line, scale=scale, starts=4)
+    assert result.scale == pytest.approx(1.1, rel=1e-5)
     assert result.standard_errors["scale"] == pytest.approx(0.05 * 1.1, rel=1e-4)
-    np.testing.assert_allclose(result.vector[:2] * result.scale, regression(noisy_line()), rtol=1e-5)
+    np.testing.assert_allclose(result.vector[:2] * result.scale, regression(line_data()), rtol=1e-5)
 
 
 def test_a_named_residual_is_no_posterior():
-    data = noisy_line()
+    data = line_data()
     result = fit(LINE, data, transport=line, objective="cosine_l2", starts=4)
     weighted = DESIGN * np.abs(data.wi[:, 2:])
     target = data.values[:, 0] * np.abs(data.wi[:, 2])
@@ -227,11 +208,11 @@ def test_starts_that_fail_are_counted_and_not_believed():
     def broken(stack, wi, wo):
         return jnp.where(stack["a"] > 2.0, jnp.nan, line(stack, wi, wo))
 
-    result = fit(LINE, noisy_line(), transport=broken, starts=16)
+    result = fit(LINE, line_data(), transport=broken, starts=16)
     assert result.converged
     assert 1 < result.minima[0].count < 16
     assert f"{16 - result.minima[0].count} of 16 starts failed" in result.status
-    result = fit({"a": Free(2.5, 2.1, 3.0), "b": LINE["b"]}, noisy_line(), transport=broken, starts=2)
+    result = fit({"a": Free(2.5, 2.1, 3.0), "b": LINE["b"]}, line_data(), transport=broken, starts=2)
     assert not result.converged
     assert np.all(np.isinf(result.errors))
     assert result.status.startswith("not converged")
@@ -273,6 +254,7 @@ PAINT = lj.Stack([], lj.Lambertian(Free(0.5, 0.0, 1.0)))
     [
         (lambda: Problem(PAINT, line_data(), lj.RandomWalk()), "RandomWalk is random; use a deterministic one"),
         (lambda: simulate(PAINT, slices(), lj.RandomWalk()), "RandomWalk is random"),
+        (lambda: simulate(PAINT, slices(), noise=5), r"noise is 5; it must be a number in \[0, "),
         (lambda: Problem(PAINT, line_data(), lj.AddingDoubling(tolerance=0.01)), "0.01 needs concrete parameters"),
         (lambda: FitOptions(same_cost=0.0), r"FitOptions.same_cost is 0.0; it must be a number in \(0, inf\)"),
         (lambda: options_from({"tolerance": 1.0}), r"\[options\] has an unknown key 'tolerance'; it must be one of"),

@@ -130,17 +130,13 @@ def test_the_posterior_is_that_of_all(joint):
 def test_measurements_that_share_nothing_are_each_alone():
     values = design(60) @ [0.9, 0.4]
     noise = np.random.default_rng(3).standard_normal((2, 60)) * [[0.03], [0.05]]
-    level, shared = (measured((values * (1 + part))[:, None]) for part in noise)
+    noises = {
+        "level": fits.Noise(relative=fits.Free(0.1, 0.001, 1.0, fits.LogNormal(0.05, 2.0))),
+        "shared": fits.Noise(0.02, discrepancy=fits.Discrepancy(length_half=10.0, length_difference=10.0)),
+    }
     problems = {
-        "level": fits.Problem(
-            LINE, level, line, fits.Noise(relative=fits.Free(0.1, 0.001, 1.0, fits.LogNormal(0.05, 2.0)))
-        ),
-        "shared": fits.Problem(
-            LINE,
-            shared,
-            line,
-            fits.Noise(relative=0.02, discrepancy=fits.Discrepancy(length_half=10.0, length_difference=10.0)),
-        ),
+        name: fits.Problem(LINE, measured((values * (1 + part))[:, None]), line, assumed)
+        for (name, assumed), part in zip(noises.items(), noise, strict=True)
     }
     together = fits.fit(fits.Joint(problems), starts=3)
     for name, one in problems.items():

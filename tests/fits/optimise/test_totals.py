@@ -1,5 +1,5 @@
 """Totals: slabs in closed form, beside values along directions, and through integrating spheres, against the sum over
-all ways that light goes between wall, ports and sample."""
+all ways that light goes between wall, ports and sample; coefficients of slabs beside inverse adding-doubling."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -7,7 +7,21 @@ import pytest
 from scipy.special import expn
 
 import layerjax as lj
-from fits import Free, Instrument, Joint, Noise, Problem, Sphere, Spheres, Totals, fit, simulate, slices
+from fits import (
+    Free,
+    Instrument,
+    Joint,
+    LogUniform,
+    Noise,
+    Problem,
+    Sphere,
+    Spheres,
+    Totals,
+    fit,
+    read_slab,
+    simulate,
+    slices,
+)
 from fits.data.spheres import Shares
 
 SINGLE = lj.SingleScattering()
@@ -60,23 +74,6 @@ def test_totals_and_values_together_tell_more_than_either():
     first, second, both = (np.linalg.inv(one.covariance) for one in (*alone, joint))
     size = np.sqrt(np.diagonal(both))
     np.testing.assert_allclose((first + second) / np.outer(size, size), both / np.outer(size, size), atol=0.05)
-
-
-def test_bad_totals_are_named():
-    for wrong, words in (
-        ({}, "give reflectance, transmittance or unscattered"),
-        ({"incidence": 95.0, "reflectance": 0.1}, r"incidence is \[95.0\], must be in \[0, 90\)"),
-        ({"reflectance": -0.1}, "values holds -0.1, must be at least 0"),
-        ({"incidence": [0, 30], "reflectance": [0.1, 0.2, 0.3]}, r"reflectance has shape \(3,\)"),
-        ({"reflectance": 0.1, "sigma": {"transmittance": 0.1}}, "sigma has nothing for reflectance"),
-        ({"reflectance": [[0.1, 0.2]], "transmittance": 0.3}, "must be as many for every kind"),
-    ):
-        with pytest.raises(ValueError, match=words):
-            Totals.of(**wrong)
-    stack, given = lj.Stack([], lj.Lambertian(Free(0.5, 0.0, 1.0))), Totals.of(reflectance=0.5)
-    for more in ({"instrument": Instrument(detector_aperture=1.0)}, {"noise": Noise(discrepancy=True)}):
-        with pytest.raises(ValueError, match=rf"{next(iter(more))}.* is given, but the data are totals"):
-            Problem(stack, given, **more)
 
 
 FRONT = Sphere(100.0, 30.0, 15.0, 10.0, 0.95, 0.1)
@@ -178,9 +175,20 @@ def test_coefficients_are_recovered_through_spheres() -> None:
     assert abs(blind.values["layers[0].mu_a"] / 0.2 - 1.0) > 0.05
 
 
+PAINT, HALF = lj.Stack([], lj.Lambertian(Free(0.5, 0.0, 1.0))), Totals.of(reflectance=0.5)
+
+
 @pytest.mark.parametrize(
     ("make", "message"),
     [
+        (lambda: Totals.of(), "give reflectance, transmittance or unscattered"),
+        (lambda: Totals.of(95.0, reflectance=0.1), r"incidence is \[95.0\], must be in \[0, 90\)"),
+        (lambda: Totals.of(reflectance=-0.1), "values holds -0.1, must be at least 0"),
+        (lambda: Totals.of([0, 30], reflectance=[0.1, 0.2, 0.3]), r"reflectance has shape \(3,\)"),
+        (lambda: Totals.of(reflectance=0.1, sigma={"transmittance": 0.1}), "sigma has nothing for reflectance"),
+        (lambda: Totals.of(reflectance=[[0.1, 0.2]], transmittance=0.3), "must be as many for every kind"),
+        (lambda: Problem(PAINT, HALF, instrument=Instrument(1.0)), "instrument.* is given, but the data are totals"),
+        (lambda: Problem(PAINT, HALF, noise=Noise(discrepancy=True)), "noise.* is given, but the data are totals"),
         (lambda: Sphere(0.0, 0.0), "Sphere.diameter is 0.0, must be a number in"),
         (lambda: Sphere(100.0, 99.999, 95.0, 95.0), "the ports cover the whole wall"),
         (lambda: Sphere(100.0, 10.0, wall=1.0), r"Sphere.wall is 1.0, must be a number in \[0, 1\)"),
@@ -188,6 +196,62 @@ def test_coefficients_are_recovered_through_spheres() -> None:
         (lambda: Spheres(FRONT, together=True), "Spheres.together: there is only one sphere"),
     ],
 )
-def test_bad_spheres(make, message: str) -> None:
+def test_refused(make, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         make()
+
+
+# ---- slabs beside inverse adding-doubling ----
+
+WITHIN = 0.02  # what is asked of coefficients, relative to iad's
+G = 0.9
+TWO_BEAMS = """\
+IAD1 1.41 1.00  # indices of refraction of sample and slides
+2.65 0 10 0.98  # [mm] thickness of sample and slides, diameter of beam; standard
+1 100 21.8 18.3 8 0.98 100 18.3 0 8 0.98  # spheres
+# Measurements made by Anisha Bahl at King's College of a PDMS
+# without glass slides using a dual beam spectrometer
+# Process this file as 'iad -X -i 8 -g 0.9 filename'
+L r t n
+600.0 0.64189 0.17381 1.42970
+"""
+"""A row of `docs/phantom_with_no_slides.rxt` of github.com/scottprahl/iad, of which iad makes mu_s' 2.9135 and mu_a
+0.0195 per mm; by spheres as the header describes them mu_s' would be 4.05."""
+
+
+@pytest.mark.slow
+def test_a_file_of_two_beams_is_what_iad_makes_of_it(tmp_path):
+    """Its coefficients give the readings within what is lost at the edges, and with spheres none that is near."""
+    path = tmp_path / "pdms.rxt"
+    path.write_text(TWO_BEAMS)
+
+    def predicted(corrected, reduced, mu_a):
+        slab = read_slab(path, incidence=8.0, corrected=corrected)
+        stack = slab.stack(Free(20.0, 1.0, 100.0), Free(0.05, 1e-3, 5.0), lj.HenyeyGreenstein(G))
+        problem = Problem(stack, slab.totals, transport=lj.AddingDoubling(nodes=12, modes=1))
+        return np.asarray(problem.predict([reduced / (1.0 - G), mu_a])) / slab.totals.values - 1.0
+
+    assert np.max(np.abs(predicted(None, 2.9135, 0.0195))) < WITHIN
+    assert np.min(np.abs(predicted(None, 4.05, 0.0168))) > 0.08
+    assert np.min(np.abs(predicted(False, 2.9135, 0.0195))) > 0.08
+    assert np.max(np.abs(predicted(False, 4.05, 0.0168))) < 0.005
+
+
+@pytest.mark.peers
+@pytest.mark.parametrize(
+    ("albedo", "depth", "g", "ior", "slides"),
+    [(0.9, 1.0, 0.0, 1.0, 1.0), (0.98, 5.0, 0.7, 1.33, 1.5)],
+)
+def test_slabs_of_its_forward_model_are_what_it_inverts_them_to(tmp_path, albedo, depth, g, ior, slides):
+    iad = pytest.importorskip("iadpython")
+    sample = {"g": g, "n": ior, "n_above": slides, "n_below": slides, "quad_pts": 16}
+    reflected, passed = (float(part) for part in iad.Sample(a=albedo, b=depth, **sample).rt()[:2])
+    inverse = iad.Experiment(sample=iad.Sample(a=None, b=None, **sample), r=reflected, t=passed, default_g=g)
+    a, b = inverse.invert_rt()[:2]
+    assert (a, b) == (pytest.approx(albedo, rel=WITHIN), pytest.approx(depth, rel=WITHIN))
+    path, glass = tmp_path / "slab.rxt", f"{slides} 1 1" if slides > 1 else "1 1 0"
+    path.write_text(f"IAD1 {ior} {glass} 5 1 0 200 25 12 1 .96 200 25 12 1 .96 2 {reflected} {passed}")
+    slab, phase = read_slab(path, sigma=0.001), lj.HenyeyGreenstein(g)
+    stack = slab.stack(Free(1.0, 0.1, 50.0, LogUniform()), Free(0.05, 1e-3, 5.0, LogUniform()), phase)
+    found = {name.rpartition(".")[2]: value for name, value in fit(stack, slab.totals, starts=1).values.items()}
+    assert found == pytest.approx({"mu_s": a * b, "mu_a": b * (1 - a)}, rel=WITHIN)

@@ -8,13 +8,11 @@ from scipy import stats
 
 from fits import ComparisonOptions, Free, compare, fit
 from fits.prediction.cross_validation import groups_of
-from tests.helpers.models import design, line, measured
+from tests.helpers.models import COUNT, LINE, design, line, line_data, measured
 
-COUNT = 120
-LINE = {"a": Free(0.9, -1.0, 3.0), "b": Free(0.1, -1.0, 3.0)}
 FLAT = {"a": Free(0.9, -1.0, 3.0), "b": 0.0}
-NOISE = 0.05 * np.random.default_rng(0).standard_normal((COUNT, 1))
-DATA = measured((design(COUNT) @ [1.0, 0.2])[:, None] + NOISE, 0.05)
+
+DATA = line_data(truth=(1.0, 0.2))
 
 
 @pytest.fixture(scope="module")

@@ -3,7 +3,6 @@
 from dataclasses import replace
 from typing import Any
 
-import jax
 import numpy as np
 import pytest
 from scipy import stats
@@ -140,14 +139,6 @@ def product(stack, wi, wo):
     return (stack["a"] * stack["b"] + 0.0 * wo[:, 2])[:, None]
 
 
-def fit_of_noise(transport: Any, free: dict[str, Free], truth: dict[str, float], starts: int = 2) -> Fit:
-    """To measurements whose noise is 0.1."""
-    at = slices([10.0, 50.0], np.arange(-75.0, 76.0, 10.0))
-    exact = np.asarray(transport(truth, at.wi, at.wo))
-    data = along(at, exact + 0.1 * np.random.default_rng(0).standard_normal(exact.shape), 0.1)
-    return fit(free, data, transport=transport, noise=Noise(discrepancy=False), starts=starts)
-
-
 @pytest.mark.parametrize(
     ("transport", "free", "truth"),
     [
@@ -158,7 +149,10 @@ def fit_of_noise(transport: Any, free: dict[str, Free], truth: dict[str, float],
 )
 def test_evidence_is_the_integral_over_the_box(transport: Any, free: dict[str, Free], truth: dict[str, float]) -> None:
     """Of posteriors that are no ellipsoids, beside quadrature; the noise is so large that the box matters."""
-    sigma, count, one = 0.1, 1500, fit_of_noise(transport, free, truth)
+    sigma, count, at = 0.1, 1500, slices([10.0, 50.0], np.arange(-75.0, 76.0, 10.0))
+    exact = np.asarray(transport(truth, at.wi, at.wo))
+    data = along(at, exact + sigma * np.random.default_rng(0).standard_normal(exact.shape), sigma)
+    one = fit(free, data, transport=transport, noise=Noise(discrepancy=False), starts=2)
     sides = [np.linspace(low, high, count + 1) for low, high in zip(one.problem.low, one.problem.high, strict=True)]
     a, b = np.meshgrid(*(0.5 * (side[1:] + side[:-1]) for side in sides), indexing="ij")
     # both are linear in two numbers: squares of the residuals by their moments
@@ -171,36 +165,6 @@ def test_evidence_is_the_integral_over_the_box(transport: Any, free: dict[str, F
     assert estimate.reliable
     assert abs(estimate.log_evidence - float(logsumexp(logs) - 2.0 * np.log(count))) < 4.0 * estimate.error
     assert estimate.error < 0.1
-
-
-@pytest.mark.slow
-@pytest.mark.peers
-def test_evidence_is_that_of_nested_sampling() -> None:
-    dynesty = pytest.importorskip("dynesty")
-
-    def lobe(stack, wi, wo):
-        half = wi + wo
-        size = (half**2).sum(axis=-1)
-        return (stack["a"] + stack["b"] * (half[:, 2] ** 2 / size) ** (1.0 / stack["c"]))[:, None]
-
-    stack = {"a": Free(0.3, 0.0, 2.0, Normal(0.3, 0.3)), "b": Free(1.0, 0.0, 5.0), "c": Free(0.2, 0.01, 2.0)}
-    found = fit_of_noise(lobe, stack, {"a": 0.3, "b": 0.4, "c": 0.3}, starts=4)
-    problem = found.problem
-    likelihood = jax.jit(problem.log_likelihood)
-    prior = stats.truncnorm((0.0 - 0.3) / 0.3, (2.0 - 0.3) / 0.3, 0.3, 0.3)
-
-    def transform(unit: np.ndarray) -> np.ndarray:
-        return np.array([prior.ppf(unit[0]), *(problem.low[1:] + unit[1:] * (problem.high - problem.low)[1:])])
-
-    sampler = dynesty.NestedSampler(
-        lambda x: float(likelihood(x)), transform, 3, nlive=500, rstate=np.random.default_rng(0)
-    )
-    sampler.run_nested(print_progress=False, dlogz=0.05)
-    estimate = evidence(found)
-    assert estimate.reliable
-    error = np.hypot(estimate.error, sampler.results.logzerr[-1])
-    assert abs(estimate.log_evidence - sampler.results.logz[-1]) < 4.0 * error
-    assert error < 0.3
 
 
 def test_weights_of_stacking_are_the_best() -> None:

@@ -6,24 +6,18 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from fits import Discrepancy, Fit, Free, Measurements, Noise, Problem, fit, predict, sample, scores, slices
+from fits import Discrepancy, Fit, Free, Measurements, Noise, fit, predict, sample, scores, slices
 from fits.data.scans import select
 from fits.prediction.predict import LEVELS
 from fits.reports.tables import UNRELIABLE, scores_table
-from tests.helpers.models import COUNT, along, design, directions, drawn_discrepancy, line, line_fit, measured
+from tests.helpers.models import COUNT, POSITIVE_LINE, along, design, directions, line, measured, wrong_line
 
-STACK = {"a": Free(0.9, 0.1, 3.0), "b": Free(0.1, -1.0, 3.0)}
-GEOMETRY = slices([10.0, 30.0, 50.0, 70.0], np.arange(-80.0, 81.0, 4.0))
 SIGMA = 0.02
 
 
 def measurements(seed: int, wrong: float, sigma: float = SIGMA) -> Measurements:
     """Of the line, with smooth errors relative to it, of another shape in every set, and noise."""
-    generator = np.random.default_rng(seed)
-    noise = Noise(relative=sigma, floor=1e-4, discrepancy=Discrepancy(max(wrong, 1e-6), 12.0, 12.0, 0.0))
-    discrepancy = drawn_discrepancy(Problem(STACK, along(GEOMETRY), line, noise), [1.0, 0.5], generator)
-    exact = np.asarray(line({"a": 1.0, "b": 0.5}, GEOMETRY.wi, GEOMETRY.wo))
-    return along(GEOMETRY, exact * (np.exp(discrepancy) + sigma * generator.standard_normal(exact.shape)))
+    return wrong_line(seed, Discrepancy(max(wrong, 1e-6), 12.0, 12.0, 0.0), sigma)
 
 
 def split(data: Measurements) -> tuple[Measurements, Measurements]:
@@ -33,33 +27,28 @@ def split(data: Measurements) -> tuple[Measurements, Measurements]:
 
 def fitted_to(data: Measurements, discrepancy: bool = True) -> Fit:
     noise = Noise(relative=SIGMA, floor=1e-4, discrepancy=discrepancy)
-    return fit(STACK, data, transport=line, noise=noise, starts=2)
+    return fit(POSITIVE_LINE, data, transport=line, noise=noise, starts=2)
 
 
-@pytest.fixture(scope="module")
-def found() -> Fit:
-    return line_fit()
-
-
-def test_intervals_of_a_line_are_those_of_regression(found: Fit) -> None:
-    at = predict(found, found.problem.data, draws=4000)
+def test_intervals_of_a_line_are_those_of_regression(result: Fit) -> None:
+    at = predict(result, result.problem.data, draws=4000)
     columns = design(COUNT)
     covariance = np.linalg.inv(columns.T @ columns / 0.05**2)
     expected = np.sqrt(np.sum(columns @ covariance * columns, axis=-1))
     # 4,000 draws: 1.5 % of a standard deviation, at 4 standard errors
     np.testing.assert_allclose(at.latent.sd[:, 0], expected, rtol=0.06)
     np.testing.assert_allclose(at.predictive.sd[:, 0], np.sqrt(expected**2 + 0.05**2), rtol=0.05)
-    np.testing.assert_allclose(at.latent.mean, found.predicted, atol=0.1 * expected.max())
+    np.testing.assert_allclose(at.latent.mean, result.predicted, atol=0.1 * expected.max())
     wide = at.predictive.quantiles[-1] - at.predictive.quantiles[0]
     np.testing.assert_allclose(wide[:, 0], 2 * stats.norm.ppf(0.975) * np.hypot(expected, 0.05), rtol=0.06)
     # a chain says the same
-    by_chain = predict(sample(found, walkers=16, max_steps=4000), found.problem.data, draws=1000)
+    by_chain = predict(sample(result, walkers=16, max_steps=4000), result.problem.data, draws=1000)
     np.testing.assert_allclose(by_chain.predictive.sd, at.predictive.sd, rtol=0.08)
     np.testing.assert_allclose(by_chain.latent.mean, at.latent.mean, atol=0.2 * at.latent.sd.max())
     # draws that may miss a part are said to
     for one, unreliable in ((at, False), (by_chain, False), (replace(at, pareto_k=0.8), True)):
         assert one.reliable != unreliable
-        assert (UNRELIABLE in scores_table(one, found.problem.data, "").note) == unreliable
+        assert (UNRELIABLE in scores_table(one, result.problem.data, "").note) == unreliable
 
 
 @pytest.mark.slow
@@ -120,23 +109,23 @@ def test_right_models_lose_little_by_it() -> None:
 def test_noise_elsewhere_is_that_of_what_was_fitted() -> None:
     fitted, _ = split(measurements(2, 0.0))
     known = replace(fitted, sigma=SIGMA * fitted.values)
-    found = fit(STACK, known, transport=line, starts=2)
+    found = fit(POSITIVE_LINE, known, transport=line, starts=2)
     at, again = (predict(found, slices([30.0], np.arange(-60.0, 61.0, 20.0))) for _ in range(2))
     np.testing.assert_allclose(at.scales, SIGMA * np.abs(at.means), rtol=0.05)
     np.testing.assert_array_equal(at.predictive.quantiles, again.predictive.quantiles)
 
 
-def test_bad_requests_are_refused(found: Fit) -> None:
-    data, at = found.problem.data, predict(found, slices([30.0]), draws=2)
-    named = fit(STACK, data, transport=line, objective="cube_root", starts=1)
+def test_bad_requests_are_refused(result: Fit) -> None:
+    data, at = result.problem.data, predict(result, slices([30.0]), draws=2)
+    named = fit(POSITIVE_LINE, data, transport=line, objective="cube_root", starts=1)
     for call, message in (
         (lambda: at.quantile(0.0), r"level is 0.0; it must be a number in \(0, 1\)"),
         (lambda: at.predictive_quantile(1.0), r"level is 1.0; it must be a number in \(0, 1\)"),
         (lambda: at.scores, "a Geometry was predicted"),
         (lambda: scores(at, data), "the measurements have other directions"),
-        (lambda: predict(found, data, draws=1), "draws: 1 is not a whole number of at least 2"),
+        (lambda: predict(result, data, draws=1), "draws: 1 is not a whole number of at least 2"),
         (lambda: predict(named, data), "a fit of 'cube_root' has no noise model"),
-        (lambda: predict(found, along(data, channels="rgb")), "measurements have the channels r, g, b, the fit c0"),
+        (lambda: predict(result, along(data, channels="rgb")), "measurements have the channels r, g, b, the fit c0"),
     ):
         with pytest.raises(ValueError, match=message):
             call()

@@ -1,7 +1,6 @@
 """Instruments: means over cones beside dense quadrature, tilted samples, gains, and what they cost."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import jax
 import numpy as np
@@ -115,17 +114,6 @@ def test_numbers_are_recovered_by_the_model_of_the_instrument() -> None:
     assert np.all(np.sum(np.abs(pulls) < 3.0, axis=0) >= 98)
     biased = (without.vectors[:, 0] - truth) / without.standard_errors[:, 0]
     assert np.all(np.abs(biased) > 3.0)
-
-
-def test_instruments_are_kept_with_a_fit(tmp_path: Path) -> None:
-    given = Instrument(0.5, 1.0, Free(0.0, -2.0, 2.0), 0.03, 1e-3)
-    data = fits.simulate(metal(0.3), GEOMETRY, SINGLE, 0.02)
-    stack = metal(Free(0.2, 0.05, 1.0))
-    found = fits.fit(stack, data, transport=SINGLE, starts=1, instrument=given)
-    fits.save_fit(found, tmp_path / "result")
-    loaded = fits.load_fit(tmp_path / "result")
-    assert loaded.problem.instrument == found.problem.instrument == replace(given, rings=1)
-    assert loaded.chi_square == pytest.approx(found.chi_square, rel=1e-9)
 
 
 @pytest.mark.parametrize(

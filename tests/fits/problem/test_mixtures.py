@@ -34,13 +34,6 @@ GEOMETRY = fits.slices([10.0, 50.0], np.arange(-75.0, 76.0, 7.5))
 SINGLE = lj.SingleScattering()
 
 
-@pytest.fixture(scope="module")
-def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("mixture") / "dusty.toml"
-    path.write_text(FILE)
-    return path
-
-
 def simulated(noise: float, seed: int = 0) -> fits.Measurements:
     thickness, alpha, weight = TRUTH.values()
     dust = lj.Stack([lj.Medium(thickness, 0.6)], lj.Lambertian(0.1))
@@ -48,8 +41,9 @@ def simulated(noise: float, seed: int = 0) -> fits.Measurements:
     return fits.simulate(mixed, GEOMETRY, SINGLE, noise, 1e-4, seed)
 
 
-def test_files_are_read_fitted_and_written(file: Path, tmp_path: Path) -> None:
-    given = fits.read_problem(file)
+def test_files_are_read_fitted_and_written(tmp_path: Path) -> None:
+    (tmp_path / "dusty.toml").write_text(FILE)
+    given = fits.read_problem(tmp_path / "dusty.toml")
     fits.write_problem(tmp_path / "again.toml", given.stack, transport=given.transport)
     again = fits.read_problem(tmp_path / "again.toml")
     one, other = (fits.Problem(each.stack, simulated(0.02), each.transport) for each in (given, again))

@@ -6,7 +6,6 @@ import pytest
 from matplotlib.figure import Figure
 
 import layerjax as lj
-from fits.cli.parser import main
 from fits.reports.render import SKY, SUN, _display, _sky, render, sphere
 from fits.reports.results import save_fit
 
@@ -47,18 +46,14 @@ def test_bad_arguments_are_named() -> None:
         render(WHITE, lj.RandomWalk(), size=16)
 
 
-def test_the_command_draws_files_and_the_best_of_a_fit(tmp_path, coat_fit, monkeypatch) -> None:
-    stack, picture, drawn = tmp_path / "haze.toml", tmp_path / "haze.png", []
-    stack.write_text(
-        'transport = "SingleScattering"\n[[layers]]\nkind = "Medium"\n'
-        'thickness = { start = 0.5, low = 0.0, high = 2.0 }\n[base]\nkind = "Lambertian"\nalbedo = 0.5\n'
-    )
-    assert main(["render", str(stack), "--out", str(picture), "--size", "16"]) == 0
-    assert picture.read_bytes().startswith(b"\x89PNG")
-    save_fit(coat_fit, tmp_path / "result")
+def test_the_command_draws_files_and_the_best_of_a_fit(work, layerjax, coat_fit, monkeypatch) -> None:
+    layerjax("render coat.toml --out haze.png --size 16")
+    assert (work / "haze.png").read_bytes().startswith(b"\x89PNG")
+    save_fit(coat_fit, "result")
+    drawn = []
     monkeypatch.setattr("fits.reports.render.render", lambda *given, **_: drawn.append(given) or Figure())
-    assert main(["render", str(tmp_path / "result"), "--out", str(tmp_path / "coat.png")]) == 0
-    assert (tmp_path / "coat.png").exists()
+    layerjax("render result --out coat.png")
+    assert (work / "coat.png").exists()
     ((stack, transport),) = drawn
     assert eqx.tree_equal(stack, coat_fit.stack, rtol=1e-12)
     assert transport == coat_fit.problem.transport

@@ -3,23 +3,27 @@
 import io
 import re
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
 import layerjax as lj
-from fits import Fit, Free, Measurements, Noise, fit, report, slices
+from fits import Fit, Free, Measurements, Noise, Sphere, Spheres, Totals, fit, load_fit, read, report, save_fit, slices
 from fits.data.measurements import Source
-from fits.data.scans import in_plane, signed_angle
+from fits.data.scans import in_plane
 from fits.reports import tables
+from fits.reports.data_summary import data_table, source_rows
 from fits.reports.html import FitReport
 from fits.reports.plots import data as pictures
 from fits.reports.plots import model as model_pictures
 from fits.reports.tables import Table, degrees, print_table, with_error
 from fits.reports.verdicts import standardised
+from tests.helpers.commands import refused
 from tests.helpers.models import along
 
 
@@ -67,20 +71,6 @@ def test_the_report_begins_with_the_verdict_and_lists_the_incidences_that_were_f
     assert text.index('class="verdict') < text.index("<h2>")
 
 
-class Terminal(io.StringIO):
-    def isatty(self) -> bool:
-        return True
-
-
-def printed(table: Table, width: int, patch: pytest.MonkeyPatch) -> str:
-    """What a terminal of that width shows, without its colours."""
-    for name, value in {"COLUMNS": str(width), "LINES": "50", "TERM": "xterm"}.items():
-        patch.setenv(name, value)
-    terminal = Terminal()
-    print_table(table, terminal)
-    return re.sub(r"\x1b\[[0-9;]*m", "", terminal.getvalue())
-
-
 def test_numbers_in_words() -> None:
     """Degrees to two decimals at most, values to two digits of their error."""
     angles = {89.8511: "89.85°", 30.0: "30°", -1e-9: "0°", 55.5: "55.5°", 359.996: "360°"}
@@ -100,7 +90,12 @@ def test_what_is_too_wide_is_folded_and_never_cut(width: int, monkeypatch: pytes
     rows = tuple(
         (f"layers[{k}].thickness", f"{1.23456 * 10**k:.4f}", "weakly identified, direction 1") for k in range(3)
     )
-    text = printed(Table("Fit", ("parameter", "value", "identifiability"), rows), width, monkeypatch)
+    for name, value in {"COLUMNS": str(width), "LINES": "50", "TERM": "xterm"}.items():
+        monkeypatch.setenv(name, value)
+    terminal = io.StringIO()
+    monkeypatch.setattr(terminal, "isatty", lambda: True)
+    print_table(Table("Fit", ("parameter", "value", "identifiability"), rows), terminal)
+    text = re.sub(r"\x1b\[[0-9;]*m", "", terminal.getvalue())  # without its colours
     assert max(map(len, text.splitlines())) <= width
     assert "…" not in text
     assert Counter("".join("".join(row).replace(" ", "") for row in rows)) <= Counter(text)
@@ -115,22 +110,6 @@ def test_a_grey_stack_is_drawn_in_all_channels(coat_data: Measurements) -> None:
     figure = model_pictures.curves_picture({"grey": grey})
     assert isinstance(figure, Figure)
     assert sum(len(line.get_xdata()) > 100 for line in figure.axes[0].lines) == 3
-
-
-def test_curves_show_data_model_and_residuals(coat_fit: Fit) -> None:
-    figure = model_pictures.curves_picture({"model": coat_fit})
-    assert isinstance(figure, Figure)
-    assert len(figure.axes) == 4  # two incidences, each with its residuals
-    upper, lower = figure.axes[:2]
-    line = next(line for line in upper.lines if line.get_label() == "model")
-    data, used = coat_fit.problem.data, coat_fit.problem.data.mask
-    rows = np.flatnonzero(used & in_plane(data) & (data.theta_i == 10))
-    expected = np.full(len(used), np.nan)
-    expected[used] = coat_fit.predicted[:, 0]
-    # the angles of the data are points of the curve
-    np.testing.assert_allclose(np.interp(signed_angle(data)[rows], *line.get_data()), expected[rows], rtol=1e-6)
-    drawn = np.concatenate([np.asarray(line.get_ydata()) for line in lower.lines if len(line.get_xdata()) > 2])
-    assert np.nanmax(np.abs(drawn)) <= np.abs(coat_fit.residuals).max() + 1e-12
 
 
 def test_maps_only_where_data_leaves_the_plane(coat_fit: Fit) -> None:
@@ -148,3 +127,61 @@ def test_maps_only_where_data_leaves_the_plane(coat_fit: Fit) -> None:
 
 def test_axes_are_logarithmic_where_the_range_is_wide() -> None:
     assert [pictures.is_logarithmic(np.array(values)) for values in ([0, 0.01, 0.2], [0, 0.1, 0.2], [0])] == [1, 0, 0]
+
+
+# ---- totals ----
+
+SPHERES = Spheres(Sphere(100.0, 20.0, 5.0, 8.0, 0.95), Sphere(90.0, 20.0, wall=0.97), 0.98, True)
+
+
+def test_a_fit_by_spheres_is_kept_and_reported(tmp_path: Path) -> None:
+    totals = Totals.of(reflectance=[[0.2, 0.3, 0.25]], transmittance=[[0.4, 0.4, 0.41]], spheres=SPHERES)
+    free = lj.Stack([lj.Medium(Free((0.7,) * 3, 0.01, 5.0), Free(0.5, 0.0, 1.0))])
+    found = fit(free, totals, transport=lj.SingleScattering(), starts=1)
+    save_fit(found, tmp_path / "kept")
+    loaded = load_fit(tmp_path / "kept")
+    assert loaded.problem.data.spheres == SPHERES
+    np.testing.assert_allclose(loaded.predicted, found.predicted, rtol=1e-12)
+    report(loaded, path=tmp_path / "report.html")
+    page = (tmp_path / "report.html").read_text()
+    assert "as measured with two integrating spheres" in page
+    assert "Shares of the incident flux with one sigma" in page
+    assert "In the plane of incidence" not in page
+
+
+def test_on_the_command_line(work: Path, capsys: pytest.CaptureFixture[str], layerjax: Callable) -> None:
+    (work / "totals.csv").write_text("theta_i,total_reflectance,total_reflectance_sigma\n0,0.30,0.003\n60,0.21,0.003\n")
+    assert "shares of the incident flux" in layerjax("info totals.csv").out
+    assert (work / "totals.png").is_file()
+    assert "layers[0].thickness" in layerjax("fit totals.csv --stack coat.toml --out result --starts 1").out
+    assert (work / "result" / "report.html").is_file()
+    layerjax("convert totals.csv copy.csv")
+    np.testing.assert_array_equal(read("copy.csv").values, read("totals.csv").values)
+    sphere = "200 25 12 1 0.96"
+    (work / "slab.rxt").write_text(f"IAD1 1.4 1.5 2.0 1.0 5 0.98 1 {sphere} {sphere} 2 0.3 0.4\n")
+    words = ["fit", "totals.csv", "--stack", "coat.toml", "--out", "r"]
+    for command, message in (
+        ([*words, "--select", "incidence=0"], "--select does not apply"),
+        ([*words, "--max-polar-angle", "50"], "--max-polar-angle does not apply"),
+        (["info", "totals.csv", "--read", "quantity=brdf_cos"], "'brdf_cos', a totals file holds shares of the light"),
+        (["search", "totals.csv", "--out", "r"], "a search needs measurements along directions"),
+        (["convert", "slab.rxt", "slab.csv"], "slab.rxt: integrating spheres"),
+    ):
+        assert message in refused(command, capsys, work)
+
+
+def test_many_channels_have_a_range_and_an_angle_has_one_colour() -> None:
+    names = tuple(f"{nm} nm" for nm in range(400, 700, 10))
+    totals = Totals.of(reflectance=np.linspace(0.1, 0.5, 30)[None], channels=names)
+    assert data_table(totals).rows == (("reflectance", "0°", "0.1", "0.5"),)
+    assert dict(source_rows(totals))["quantity"] == "shares of the incident flux"
+    assert len(pictures.totals_picture(totals).axes[0].get_xticks()) == 10
+    both = Totals.of([8.0, 60.0], reflectance=np.full((2, 2), 0.4), transmittance=np.full((2, 2), 0.3))
+    picture = pictures.totals_picture(both, SimpleNamespace(predicted=both.values))
+    words = {text.get_text() for text in picture.legends[0].get_texts()}
+    assert words == {f"{what} at {angle}°" for what in ("measured", "fit") for angle in (8, 60)}
+    first, second = (
+        {line.get_color() for line in axes.lines if "fit" in str(line.get_label())} for axes in picture.axes
+    )
+    assert first == second
+    assert len(first) == 2
