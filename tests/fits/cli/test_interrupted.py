@@ -38,7 +38,7 @@ def refusal(words, capsys):
     [
         ("fits.sampling.sample.sample", ["sample", "result"], "the chain is kept, `layerjax sample result` resumes it"),
         ("fits.batch.fit_one", FIT_MANY, "out keeps what was fitted; the same command resumes it"),
-        ("fits.maps.fit_map.fit_map", FIT_MAP, "what was fitted is in coat.zarr; the same command resumes it"),
+        ("fits.maps.fit_map.fit_map", FIT_MAP, "coat.zarr keeps what was fitted; the same command resumes it"),
         ("fits.structure_search.search", ["search", "data.csv", "--out", "out"], "out keeps what was fitted"),
     ],
 )
