@@ -37,7 +37,7 @@ from fits.optimise.result import OUTCOMES, Fit, Minimum, WithoutDiscrepancy
 from fits.optimise.uncertainty import UNCONSTRAINED_BEYOND
 from fits.problem.instrument import Instrument
 from fits.problem.model import Transport
-from fits.problem.noise import DEFAULT_RELATIVE, Noise
+from fits.problem.noise import Noise
 from fits.problem.parameters import Free
 from fits.problem.problem import FittingProblem, Problem
 from fits.progress import Progress, given_progress, silent
@@ -201,31 +201,12 @@ def _fit_from(
 
 
 def _result(at: Optimum, accuracy: Accuracy | None, run: _Run, without: Mapping[str, WithoutDiscrepancy]) -> Fit:
-    """The fit of an optimum: values, errors, minima, and its status in words."""
-    problem, lowest, found, options, total = at.problem, at.lowest, at.uncertainty, run.options, len(at.ends)
+    """The fit of an optimum: values, errors, minima."""
+    problem, lowest, found, options = at.problem, at.lowest, at.uncertainty, run.options
     at_bound = tuple(name for name, held in zip(problem.names, found.at_bound, strict=True) if held)
     minima, outcomes = _minima(problem, at, options)
     equivalent = options.equivalent_cost * at.excess
     alternatives = tuple(minimum for minimum in minima[1:] if minimum.cost - lowest.cost < equivalent)
-    status = [
-        f"converged; {outcomes['best minimum']} of {total} starts converged to the best minimum"
-        if lowest.converged
-        else f"not converged: the lowest of {total} starts did not; these are the best values seen"
-    ]
-    others = {word: outcomes[key] for key, word in OUTCOMES.items() if key != "best minimum"}
-    status += [f"{count} of {total} starts {word}" for word, count in others.items() if count]
-    if at_bound:
-        status.append(f"at a bound: {', '.join(at_bound)}; the errors of the others hold with them kept there")
-    if alternatives:
-        words = f"{len(alternatives)} more local minima fit equally well"
-        status.append(f"errors are conditional on this local minimum; {words}")
-    if problem.objective != "likelihood":
-        words = "the errors are scaled by its scatter, no posterior"
-        status.append(f"objective {problem.objective} is no likelihood: {words}")
-    elif any(one.noise_is_assumed for one in problem.problems.values()):
-        status.append(f"a noise of {100.0 * DEFAULT_RELATIVE:g} % of the model's value was assumed, none is stated")
-    status += ["L-BFGS-B improved on Levenberg-Marquardt"] if at.improved else []
-    status += [] if accuracy is None else [accuracy.words]
     result = Fit(
         problem=cast(Problem, problem),  # or a `Joint`, of whose data sets `Fit.part` says more
         vector=lowest.vector,
@@ -234,7 +215,6 @@ def _result(at: Optimum, accuracy: Accuracy | None, run: _Run, without: Mapping[
         cost=lowest.cost,
         at_bound=at_bound,
         converged=lowest.converged,
-        status="; ".join(status),
         iterations=lowest.steps,
         condition_number=found.condition_number,
         unidentified=found.unidentified,

@@ -216,11 +216,10 @@ class Choice(NamedTuple):
 
 
 class Accuracy(NamedTuple):
-    """The resolution of a fit in words, the numerical error there in standard deviations, and what is said of it."""
+    """The resolution of a fit in words, and the numerical error there in standard deviations of the data."""
 
     resolution: str
     error: float
-    words: str
 
 
 def for_starts(problem: FittingProblem) -> tuple[FittingProblem, dict[str, Choice]]:
@@ -253,11 +252,8 @@ def refined(
         if not accuracies:
             return at, None
         if not changed:
-            resolution, words = (
-                "; ".join(f"{name}: {one[place]}" if name else str(one[place]) for name, one in accuracies.items())
-                for place in (0, 2)
-            )
-            return at, Accuracy(resolution, float(np.max([one.error for one in accuracies.values()])), words)
+            words = [f"{name}: {one.resolution}" if name else one.resolution for name, one in accuracies.items()]
+            return at, Accuracy("; ".join(words), float(np.max([one.error for one in accuracies.values()])))
         whole = at.problem.with_problems(changed)
         again = polish(whole, _fitted_again(at, whole, options.equivalent_cost, progress), check=at.improved)
         at = again._replace(improved=again.improved or at.improved)
@@ -267,7 +263,7 @@ def _judged(
     problem: Problem, choice: Choice, vector: Floats, predicted: Floats, options: FitOptions, progress: Progress
 ) -> tuple[Problem, Accuracy | None]:
     """The data set at the resolution that its noise asks for, and how accurate it is now."""
-    needed, errors, words = problem, [], []
+    needed, errors, note = problem, [], ""
     if (known := choice.resolutions) is not None:
         own = transport_of(problem, known)
         progress("numerical error", 0, None, f"at {known.in_words(own)}")
@@ -276,18 +272,16 @@ def _judged(
         if known.open and transport != own:
             needed = replace(needed, transport=transport)
         errors.append(error)
-        words.append(_error_in_words(known.in_words(own), error, finest, known.open))
+        note = ", as given" if not known.open else ", the finest tried" if finest else ""
     if has_rays(problem):
         rings = rings_of_lobes(problem, vector) if choice.rays else 0
         if rings > (cast(Any, problem.instrument).rings or 0):
             needed = with_rings(needed, rings)
         other = problem.with_other_rays().predict(vector) if needed is problem else np.nan
         errors.append(float(np.max(np.abs(predicted - np.asarray(other)) / spread(problem, vector, predicted))))
-        words.append(_error_in_words(_rings_in_words(problem), errors[-1], False, choice.rays))
     if not errors:
         return problem, None
-    said = f"numerical error of the model: {', '.join(words)}"
-    return needed, Accuracy(resolution_in_words(problem, known), float(np.sum(errors)), said)  # errors add up
+    return needed, Accuracy(resolution_in_words(problem, known) + note, float(np.sum(errors)))  # errors add up
 
 
 def transport_of(problem: Problem, known: Resolutions) -> lj.AddingDoubling:
@@ -298,21 +292,8 @@ def transport_of(problem: Problem, known: Resolutions) -> lj.AddingDoubling:
 def resolution_in_words(problem: Problem, known: Resolutions | None) -> str:
     """The resolution of a problem whose transport may have one."""
     parts = [] if known is None else [known.in_words(transport_of(problem, known))]
-    return ", ".join(parts + ([_rings_in_words(problem)] if has_rays(problem) else []))
-
-
-def _rings_in_words(problem: Problem) -> str:
-    rings = cast(Any, problem.instrument).rings or 1
-    return f"{rings} ring{'s' if rings > 1 else ''} of rays a cone"
-
-
-def _error_in_words(resolution: str, error: float, finest: bool, is_open: bool) -> str:
-    """finest: the resolution is the finest tried, so that the error is that of a coarser one."""
-    if not np.isfinite(error):
-        return f"not known at {resolution}"
-    if finest:
-        return f"up to {error:.2g} sigma at {resolution}{', the finest tried' if is_open else ''}"
-    return f"{error:.2g} sigma at most at {resolution}{'' if is_open else ', as given'}"
+    rings = cast(Any, problem.instrument).rings or 1 if has_rays(problem) else 0
+    return ", ".join(parts + ([f"{rings} ring{'s' if rings > 1 else ''} of rays a cone"] if rings else []))
 
 
 def _fitted_again(at: Optimum, problem: FittingProblem, equivalent: float, progress: Progress) -> list[Descent]:

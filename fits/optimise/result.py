@@ -1,5 +1,6 @@
 """The outcome of a fit: values, how far to trust them, and what else would explain the data."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -61,7 +62,6 @@ class Fit:
         cost: half the sum of squared residuals.
         at_bound: names of the parameters that ended on a bound.
         converged: whether the best start did.
-        status: how the fit ended, in words.
         iterations: steps of the solver to the best minimum.
         condition_number: of the information about the parameters, each scaled to unit length.
         unidentified: the directions in the space of parameters that the data alone do not identify, worst first.
@@ -88,7 +88,6 @@ class Fit:
     cost: float
     at_bound: tuple[str, ...]
     converged: bool
-    status: str
     iterations: int
     condition_number: float
     unidentified: tuple[Direction, ...]
@@ -160,6 +159,22 @@ class Fit:
         if self.dataset is not None:
             words = "without the others it says something else; fit it by itself, or take the whole fit"
             raise ValueError(f"{what}: {self.dataset!r} is a part of a joint fit, and {words}")
+
+    @property
+    def status(self) -> str:
+        """How the fit ended, in words."""
+        total, best = sum(self.start_outcomes.values()), self.start_outcomes.get("best minimum")
+        words = ["converged" if self.converged else "not converged, these are the best values seen"]
+        words += [f"{count} of {total} starts {OUTCOMES[how]}" for how, count in self.start_outcomes.items() if count]
+        words += ["more starts may find a better one"] if best == 1 < total else []
+        words += [f"at a bound: {', '.join(self.at_bound)}"] if self.at_bound else []
+        if self.alternatives:
+            others = f"{len(self.alternatives)} more local minima fit equally well"
+            words.append(f"errors are conditional on this local minimum; {others}")
+        if self.resolution is not None:
+            error = numerical_error_in_words(self.numerical_error)
+            words.append(f"numerical error of the model: {error} at {self.resolution}")
+        return "; ".join(words)
 
     @property
     def values(self) -> dict[str, float]:
@@ -235,3 +250,8 @@ class Fit:
         spread = np.sqrt(np.diagonal(self.covariance))
         spread = np.where(spread > 0, spread, np.nan)
         return self.covariance / np.outer(spread, spread)
+
+
+def numerical_error_in_words(error: float | None) -> str:
+    """How far the resolution keeps the model from its limit."""
+    return "not known" if error is None or not math.isfinite(error) else f"{error:.2g} sigma at most"

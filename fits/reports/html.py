@@ -106,7 +106,7 @@ class FitReport:
                 sampling.append(_picture(corner, "Samples of the posterior; orange: the best fit."))
 
         residuals = [one.sentence for one in verdicts.statements(facts)["residuals"]]
-        residuals.append(f"{verdicts.starts_in_words(fit)}.")
+        residuals.append(f"Fit: {fit.status}.")
         correlation = _picture(model.correlation_picture(fit), "Correlation of the fitted parameters.")
         stack = tomli_w.dumps(material_to_dict(fit.stack))
         title = f"Fit of {Path(data.source.path).name or f'{data.source.format} data'}"

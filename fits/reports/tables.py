@@ -12,9 +12,10 @@ from fits.data.geometry import azimuth, polar
 from fits.data.measurements import Measurements
 from fits.data.scans import incidences
 from fits.optimise.limits import instrument_limits
+from fits.optimise.result import numerical_error_in_words
 from fits.prediction.predict import LEVELS, scores
 from fits.reports.pages import Table
-from fits.reports.verdicts import identifiability, numerical_error, standardised
+from fits.reports.verdicts import identifiability, standardised
 
 if TYPE_CHECKING:
     from fits.optimise.result import Fit
@@ -103,7 +104,7 @@ def problem_rows(fit: "Fit") -> tuple[tuple[str, str], ...]:
         ("transport", transport if fit.resolution is None else f"{transport}, {fit.resolution}"),
     ]
     if fit.resolution:
-        rows.append(("numerical error of the model", numerical_error(fit.numerical_error)))
+        rows.append(("numerical error of the model", numerical_error_in_words(fit.numerical_error)))
     return tuple(rows)
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from fits.data.scans import correlation, neighbours
 from fits.optimise.limits import instrument_limits
 from fits.optimise.options import FitOptions
-from fits.optimise.result import OUTCOMES
+from fits.optimise.result import numerical_error_in_words
 from fits.optimise.uncertainty import UNCONSTRAINED_BEYOND, UNIDENTIFIED_BEYOND, Direction
 from fits.problem.model import Model
 from fits.problem.noise import DEFAULT_RELATIVE
@@ -356,7 +356,7 @@ def _remarks(f: Assessment) -> list[Statement]:
         words = f"{words} The reduced chi-square is {f.ratio:.3g} with it and {without:.3g} without."
         remarks.append(Statement(words))
     if not f.resolved:
-        error = numerical_error(f.numerical_error)
+        error = numerical_error_in_words(f.numerical_error)
         remarks.append(Statement(f"The numerical error of the model is {error}: a finer resolution may change values."))
     if f.noise_assumed:
         remarks.append(Statement(NOISE_ASSUMED))
@@ -410,22 +410,10 @@ def verdict(fit: "Fit", facts: Assessment | None = None) -> Verdict:
 
 
 def summary(fit: "Fit") -> list[str]:
-    """A few lines for the terminal: the verdict, chi-square, starts and numerical error."""
+    """A few lines for the terminal: the verdict, chi-square, and how the fit ended."""
     opening = verdict(fit)
     good = f"chi2/dof {fit.reduced_chi_square:.4g} ({fit.chi_square:.6g} / {fit.degrees_of_freedom})"
-    accurate = f"; numerical error of the model: {numerical_error(fit.numerical_error)}" if fit.resolution else ""
-    return [*opening.sentences, *opening.remarks, f"{good}; {starts_in_words(fit)}{accurate}"]
-
-
-def starts_in_words(fit: "Fit") -> str:
-    """How many starts there were, and how they ended."""
-    counts = fit.start_outcomes
-    if not (total := sum(counts.values())):
-        return "starts are not recorded"
-    term = " with the discrepancy term" if fit.without_discrepancy is not None else ""
-    words = [f"{counts['best minimum']} of {total} starts{term} converged to the best minimum"]
-    words += [f"{counts[key]} {word}" for key, word in OUTCOMES.items() if key != "best minimum" and counts[key]]
-    return ", ".join(words) + ("; more starts may find a better one" if counts["best minimum"] == 1 < total else "")
+    return [*opening.sentences, *opening.remarks, f"{good}; {fit.status}"]
 
 
 def sampled(posterior: "Posterior") -> list[str]:
@@ -462,11 +450,6 @@ def sampled(posterior: "Posterior") -> list[str]:
 def reportable(posterior: "Posterior") -> bool:
     """Whether estimates may be had from the chain."""
     return posterior.converged or posterior.allow_unconverged
-
-
-def numerical_error(error: float | None) -> str:
-    """How far the resolution keeps the model from its limit, in a few words."""
-    return "not known" if error is None or not math.isfinite(error) else f"{error:.2g} sigma at most"
 
 
 def listed(names: Sequence[str]) -> str:
