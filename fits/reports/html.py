@@ -76,15 +76,19 @@ class FitReport:
             caption = "Shares of the incident flux with one sigma, and those of the fit."
             compared.append(_picture(totals_picture(data, fit), caption))
         else:
-            caption = "In the plane of incidence. Grey: one sigma of the noise model."
+            caption = "In the plane of incidence, with one sigma of the noise model; grey points were not used."
             if fit.problem.noise.discrepancy:
                 caption += " Residuals are those of the curve with model discrepancy."
+            if self.estimates is not None:
+                caption += " The interval is that of the posterior, without discrepancy and noise."
             compared.append(_picture(model.curves_picture({self.name: fit}, self.estimates), caption))
             caption = "From above, forward to the right, rings at 30°, 60° and 90°; star: the light."
             compared.append(_picture(model.maps_picture(fit), caption))
         if self.held_out is not None and self.predicted is not None:
             compared.append(tables.scores_table(self.predicted, self.held_out, "Held-out data"))
-            caption = "Held-out data in the plane of incidence, and their prediction intervals."
+            caption = (
+                "Held-out data in the plane of incidence, and their prediction; residuals in its standard deviations."
+            )
             compared.append(_picture(model.prediction_picture(self.predicted, self.held_out), caption))
 
         # what the data identify

@@ -63,8 +63,8 @@ def data_picture(data: "Measurements") -> Figure:
     Of more than six channels some are shown, evenly spaced and with both ends.
     """
     data = data.of_channels(evenly_spaced(data.channels, MOST_CHANNELS))
-    flat, used, shown = in_plane(data), data.mask, chosen(data)
-    maps = mapped(data, shown)
+    flat, shown, maps = in_plane(data), chosen(data), mapped(data)
+    colours = mpl.colormaps["viridis"](np.linspace(0.0, 0.85, len(shown)))  # dark to light
     sizes = [3.6] * bool(flat.any()) + [2.6] * bool(maps)
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(9.5, sum(sizes)), layout="constrained")
@@ -72,20 +72,15 @@ def data_picture(data: "Measurements") -> Figure:
         if flat.any():
             panels = parts[0].subplots(1, len(data.channels), sharey=True, squeeze=False)[0]
             for channel, axes in enumerate(panels):
-                for incidence, place in zip(shown, np.linspace(0.0, 0.85, len(shown)), strict=True):  # dark to light
-                    rows, colour = (
-                        incidence.rows[flat[incidence.rows]],
-                        mpl.colors.to_hex(mpl.colormaps["viridis"](place)),
-                    )
-                    draw_points(axes, data, rows[used[rows]], channel, colour, incidence.label, data.sigma)
-                    draw_points(axes, data, rows[~used[rows]], channel, GREY)
+                for incidence, colour in zip(shown, map(mpl.colors.to_hex, colours), strict=True):
+                    rows = incidence.rows[flat[incidence.rows]]
+                    draw_points(axes, data, rows, channel, colour, incidence.label, data.sigma)
                 value_axis(axes, data.values[flat], value_label(data, channel))
-            if panels[0].get_legend_handles_labels()[0]:
-                panels[0].legend(loc="best", ncols=2 if len(shown) > 4 else 1)
+            panels[0].legend(loc="best", ncols=2 if len(shown) > 4 else 1)
             parts[0].supxlabel(ANGLE_LABEL, fontsize="medium")
         if maps:
-            values = np.where(used, data.values[:, 0], np.nan)
-            norm = value_norm(values[used])
+            values = np.where(data.mask, data.values[:, 0], np.nan)
+            norm = value_norm(values[data.mask])
             panels = parts[-1].subplots(1, len(maps), squeeze=False)[0]
             for panel, incidence in zip(panels, maps, strict=True):
                 image = hemisphere_map(panel, data, incidence, values, norm, "viridis")
@@ -145,10 +140,10 @@ def chosen(data: "Measurements") -> list[Incidence]:
     return evenly_spaced(incidences(data), MOST_INCIDENCES)
 
 
-def mapped(data: "Measurements", shown: list[Incidence]) -> list[Incidence]:
-    """The incidences among `shown` whose viewers leave the plane of incidence enough to draw a map, at most four."""
+def mapped(data: "Measurements") -> list[Incidence]:
+    """The incidences whose viewers leave the plane of incidence enough to draw a map, at most four."""
     off_plane = ~in_plane(data) & data.mask
-    spread = [incidence for incidence in shown if np.count_nonzero(off_plane[incidence.rows]) >= 10]
+    spread = [incidence for incidence in chosen(data) if np.count_nonzero(off_plane[incidence.rows]) >= 10]
     return evenly_spaced(spread, 4) if spread else []
 
 
@@ -168,16 +163,19 @@ def draw_points(
     rows: np.ndarray,
     channel: int,
     colour: str,
-    label: str | None = None,
+    label: str,
     sigma: np.ndarray | None = None,
 ) -> None:
-    """Values of `rows` against the signed angle, with error bars from `sigma` (N, C); nothing when `rows` is empty."""
-    if not rows.size:
-        return
-    errors = None if sigma is None else np.nan_to_num(sigma[rows, channel])
-    style: dict[str, Any] = {"fmt": "o", "markersize": 2.5 if len(rows) > 60 else 3.5, "markeredgewidth": 0.0}
-    style |= {"color": colour, "elinewidth": 0.6, "ecolor": mpl.colors.to_rgba(colour, 0.35), "zorder": 2}
-    axes.errorbar(signed_angle(data)[rows], data.values[rows, channel], errors, label=label, **style)
+    """Values of `rows` against the signed angle, with error bars from `sigma` (N, C); grey where they are not used."""
+    signed, style = signed_angle(data), {"fmt": "o", "markersize": 2.5 if len(rows) > 60 else 3.5}
+    style |= {"markeredgewidth": 0.0, "elinewidth": 0.6, "zorder": 2}
+    used, others = rows[data.mask[rows]], rows[~data.mask[rows]]
+    if used.size:
+        errors, pale = None if sigma is None else sigma[used, channel], mpl.colors.to_rgba(colour, 0.35)
+        points = signed[used], data.values[used, channel], errors
+        axes.errorbar(*points, color=colour, ecolor=pale, label=label, **style)
+    if others.size:
+        axes.errorbar(signed[others], data.values[others, channel], color=GREY, **style)
 
 
 def is_logarithmic(values: np.ndarray) -> bool:

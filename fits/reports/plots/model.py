@@ -1,6 +1,6 @@
 """Pictures of a fit, and of predictions, beside data, and of its parameters."""
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import matplotlib as mpl
 import numpy as np
@@ -15,7 +15,6 @@ from fits.problem.model import Model
 from fits.reports.plots.data import (
     ANGLE_LABEL,
     CYCLE,
-    GREY,
     INK,
     STYLE,
     channel_colour,
@@ -56,26 +55,64 @@ def misfit(fit: "Fit") -> np.ndarray:
     return over_all_rows(fit, independent / residual_unit(fit))
 
 
+class Curve(NamedTuple):
+    """A model along one incidence: viewing angles (M,), BSDF (M, C), that of the stack without model discrepancy, and
+    the ends of an interval, (2, M, C); None where there is no discrepancy, or no interval."""
+
+    angle: Floats
+    values: Floats
+    latent: Floats | None
+    interval: Floats | None
+
+
 def curves_picture(fits: "dict[str, Fit]", posterior: "Posterior | None" = None) -> Figure | None:
-    """Data and models per incidence against the signed viewing angle, with residuals in units of sigma below each.
+    """Data and models along each incidence, with standardised residuals below.
 
     With a model discrepancy there are two curves, with and without it; residuals are of the first.
 
     fits: one or more fits of the same data by name; the points and their errors are those of the first one.
     posterior: adds the central interval of 95 % of its draws, of the stack without discrepancy and noise, to the first.
-    Every incidence has an axis of its own: linear, or logarithmic where its values span a wide range.
     None where no incidence has at least three measurements in the plane of incidence.
     """
     first = next(iter(fits.values()))
-    data, signed = first.problem.data, signed_angle(first.problem.data)
-    shown = _in_plane(data)
+    shown, sigma = _in_plane(first.problem.data), None
     if not shown:
         return None
-    curves = {name: _curves(fit, shown, posterior if fit is first else None) for name, fit in fits.items()}
-    residuals = {name: misfit(fit) for name, fit in fits.items()}
-    columns = 1 if len(shown) == 1 else 2 if len(shown) <= 4 else 3
+    if first.is_posterior:
+        sigma = over_all_rows(first, np.asarray(first.problem.call(Model.sigma_at, first.vector, first.predicted)))
+    drawn = fits if len(fits) > 1 else {"model": first}
+    curves = {name: _curves(fit, shown, posterior if fit is first else None) for name, fit in drawn.items()}
+    return _panels(first.problem.data, shown, curves, list(map(misfit, fits.values())), sigma)
+
+
+def prediction_picture(prediction: "Prediction", data: "Measurements") -> Figure | None:
+    """Held-out data and the median and interval of their prediction, which is of the used data, along each incidence.
+
+    None where no incidence has at least three measurements in the plane of incidence.
+    """
+    used, whole = data.used(), prediction.predictive
+    shown, signed, curves = _in_plane(used), signed_angle(used), []
+    for rows in (one.rows[np.argsort(signed[one.rows], kind="stable")] for one in shown):
+        latent = None if prediction.discrepancy_sd is None else prediction.latent.quantiles[2][rows]
+        curves.append(Curve(signed[rows], whole.quantiles[2][rows], latent, whole.quantiles[[0, -1]][:, rows]))
+    return _panels(used, shown, {"median": curves}, [(used.values - whole.mean) / whole.sd], None) if shown else None
+
+
+def _panels(
+    data: "Measurements",
+    shown: list[Incidence],
+    curves: dict[str, list[Curve]],
+    residuals: list[Floats],
+    sigma: Floats | None,
+) -> Figure:
+    """A panel for each incidence with data and models against the signed viewing angle, and standardised residuals
+    (N, C) of each model below; sigma: of the data, (N, C).
+
+    Every incidence has an axis of its own: linear, or logarithmic where its values span a wide range.
+    """
+    signed, columns = signed_angle(data), 1 if len(shown) == 1 else 2 if len(shown) <= 4 else 3
     blocks = -(-len(shown) // columns)
-    coloured = len(data.channels) > 1 and len(fits) == 1  # by channel, else by fit
+    coloured = len(data.channels) > 1 and len(curves) == 1  # by channel, else by model
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(9.5, 4.0 * blocks), layout="constrained")
         grid = figure.add_gridspec(2 * blocks, columns, height_ratios=[3.0, 1.2] * blocks)
@@ -88,23 +125,36 @@ def curves_picture(fits: "dict[str, Fit]", posterior: "Posterior | None" = None)
             lower.axhspan(-1.0, 1.0, color="#eeeeee", zorder=0)
             lower.axhline(0.0, color=INK, linewidth=0.6)
             rows = incidence.rows
-            _points(upper, first, rows, coloured)
-            for place, name in enumerate(fits):
-                for channel, channel_name in enumerate(data.channels):
+            for channel, channel_name in enumerate(data.channels):
+                colour = channel_colour(channel_name, channel) if coloured else INK
+                label = f"data, {channel_name}" if len(data.channels) > 1 else "data"
+                draw_points(upper, data, rows, channel, colour, label, sigma)
+                for place, (name, along) in enumerate(curves.items()):
                     colour = channel_colour(channel_name, channel) if coloured else CYCLE[place % len(CYCLE)]
-                    label = None if channel else "model" if len(fits) == 1 else name
-                    _line(upper, curves[name][index], channel, colour, label, place)
+                    _line(upper, along[index], channel, colour, "" if channel else name, place)
                     points: dict[str, Any] = {"markersize": 2.2, "color": colour, "markeredgewidth": 0.0}
-                    lower.plot(signed[rows], residuals[name][rows, channel], "o", **points)
+                    lower.plot(signed[rows], residuals[place][rows, channel], "o", **points)
             value_axis(upper, data.values[rows[data.mask[rows]]], "BRDF, 1/sr" if column == 0 else "")
             upper.set_title(incidence.label)
             upper.tick_params(labelbottom=False)
-            unit = r"$\sigma$" if first.is_posterior else "scatter"
-            lower.set_ylabel(f"residual / {unit}" if column == 0 else "")
+            lower.set_ylabel(r"residual / $\sigma$" if column == 0 else "")
         figure.supxlabel(ANGLE_LABEL, fontsize="medium")
         handles, labels = figure.axes[0].get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside upper center", ncols=4)
     return figure
+
+
+def _line(axes: Axes, curve: Curve, channel: int, colour: str, name: str, place: int) -> None:
+    """One channel of a model; name: in the legend, empty after the first channel."""
+    angle, values, latent, ends = curve
+    label = f"{name} with discrepancy" if name and latent is not None else name
+    axes.plot(angle, values[:, channel], color=colour, linewidth=1.3, label=label, zorder=3)
+    if latent is not None:
+        label = "without discrepancy" if name and not place else ""
+        axes.plot(angle, latent[:, channel], "--", color=colour, linewidth=1.0, label=label, zorder=3)
+    if ends is not None:
+        style: dict[str, Any] = {"color": colour, "alpha": 0.3, "linewidth": 0.0, "zorder": 2.5}
+        axes.fill_between(angle, *ends[:, :, channel], label="95 % interval" if name else "", **style)
 
 
 def _in_plane(data: "Measurements") -> list[Incidence]:
@@ -114,12 +164,8 @@ def _in_plane(data: "Measurements") -> list[Incidence]:
     return [Incidence(one.theta, one.phi, one.rows[flat[one.rows]]) for one in enough]
 
 
-def _curves(fit: "Fit", shown: list[Incidence], posterior: "Posterior | None") -> list[tuple[Any, ...]]:
-    """The model along each incidence, all of them predicted at once.
-
-    Viewing angles (M,), BSDF (M, C), that of the stack without the model discrepancy, and the ends of an interval of
-    the latter, (2, M, C); None where there is no discrepancy, or no posterior.
-    """
+def _curves(fit: "Fit", shown: list[Incidence], posterior: "Posterior | None") -> list[Curve]:
+    """The model along each incidence, all of them predicted at once; its interval is without discrepancy."""
     signed, angles = signed_angle(fit.problem.data), []
     for incidence in shown:
         own = signed[incidence.rows]
@@ -133,56 +179,26 @@ def _curves(fit: "Fit", shown: list[Incidence], posterior: "Posterior | None") -
         picked = np.linspace(0, len(posterior.samples) - 1, INTERVAL_DRAWS).astype(int)
         vectors = np.concatenate([vectors, np.asarray(posterior.samples)[picked]])
     values = np.asarray(fit.problem.predict_at(vectors, wi, wo))
-    values = np.broadcast_to(
-        values, (*values.shape[:2], len(fit.problem.data.channels))
-    )  # a grey stack is the same in all
+    # a grey stack is the same in all channels
+    values = np.broadcast_to(values, (*values.shape[:2], len(fit.problem.data.channels)))
+    best, latent = with_discrepancy(fit, wi, wo, values[0]), values[0] if fit.problem.noise.discrepancy else None
+    ends = None if posterior is None else np.quantile(values[1:], [0.025, 0.975], axis=0)
 
     def parts(along: Floats | None, axis: int = 0) -> list[Any]:
         cuts = np.cumsum([len(angle) for angle in angles])[:-1]
         return [None] * len(angles) if along is None else np.split(along, cuts, axis)
 
-    best, latent = with_discrepancy(fit, wi, wo, values[0]), values[0] if fit.problem.noise.discrepancy else None
-    interval = None if posterior is None else np.quantile(values[1:], [0.025, 0.975], axis=0)
-    return list(zip(angles, parts(best), parts(latent), parts(interval, 1), strict=True))
+    return list(map(Curve, angles, parts(best), parts(latent), parts(ends, 1)))
 
 
-def _points(axes: Axes, fit: "Fit", rows: np.ndarray, coloured: bool) -> None:
-    """The data of an incidence, with the noise that the fit assumed."""
-    data, what, sigma = fit.problem.data, "data", None
-    if fit.is_posterior:
-        assumed = np.asarray(fit.problem.call(Model.sigma_at, fit.vector, fit.predicted))
-        what, sigma = r"data and $\sigma$ of the noise model", over_all_rows(fit, assumed)
-    used = data.mask[rows]
-    for channel, name in enumerate(data.channels):
-        colour = channel_colour(name, channel) if coloured else INK
-        label = f"{what}, {name}" if len(data.channels) > 1 else what
-        draw_points(axes, data, rows[used], channel, colour, label, sigma)
-        draw_points(axes, data, rows[~used], channel, GREY, None if channel else "not used")
-
-
-def _line(axes: Axes, curve: tuple[Any, ...], channel: int, colour: str, label: str | None, place: int) -> None:
-    """One channel of a model, labelled for the legend where it is the first."""
-    angle, values, latent, interval = curve
-    what = label if label is None or latent is None else f"{label} with discrepancy"
-    axes.plot(angle, values[:, channel], color=colour, linewidth=1.3, label=what, zorder=3)
-    if latent is not None:
-        what = "without discrepancy" if label and not place else None
-        axes.plot(angle, latent[:, channel], "--", color=colour, linewidth=1.0, label=what, zorder=3)
-    if interval is not None:
-        which = ", without discrepancy" if latent is not None else ""
-        what = f"95 % of the posterior{which}" if label else None
-        low, high = interval[:, :, channel]
-        axes.fill_between(angle, low, high, color=colour, alpha=0.3, linewidth=0.0, label=what, zorder=2.5)
-
-
-def maps_picture(fit: "Fit", channel: int = 0) -> Figure | None:
-    """Data, model and residual over the viewer's hemisphere, a row per incidence; None for data that stays in plane."""
+def maps_picture(fit: "Fit") -> Figure | None:
+    """Data, model and residual over the viewer's hemisphere, a row per incidence, of the first channel; None for data
+    that stays in plane."""
     data = fit.problem.data
-    shown = mapped(data, chosen(data))
-    if not shown:
+    if not (shown := mapped(data)):
         return None
-    values = np.where(data.mask, data.values[:, channel], np.nan)
-    predicted, residuals = bsdf(fit)[:, channel], misfit(fit)[:, channel]
+    values = np.where(data.mask, data.values[:, 0], np.nan)
+    predicted, residuals = bsdf(fit)[:, 0], misfit(fit)[:, 0]
     norm = value_norm(values[data.mask])
     limit = float(np.clip(np.nanquantile(np.abs(residuals), 0.98), 3.0, 30.0))
     model = "with discrepancy" if fit.problem.noise.discrepancy else "model"
@@ -196,42 +212,8 @@ def maps_picture(fit: "Fit", channel: int = 0) -> Figure | None:
             for axes, what in zip(row, ("data", model, "residual"), strict=True):
                 axes.set_title(f"{incidence.label}: {what}")
         bar: dict[str, Any] = {"shrink": 0.7, "aspect": 30}
-        figure.colorbar(image, ax=panels[:, :2].ravel().tolist(), label=value_label(data, channel), **bar)
-        label = rf"(data $-$ {model}) / $\sigma$" if fit.is_posterior else "residual / its scatter"
-        figure.colorbar(signed, ax=panels[:, 2].tolist(), label=label, extend="both", **bar)
-    return figure
-
-
-def prediction_picture(prediction: "Prediction", data: "Measurements") -> Figure | None:
-    """Held-out data and their prediction intervals, a column for each incidence and a row for each channel.
-
-    prediction: of the used data, with levels 0.025, 0.25, 0.5, 0.75 and 0.975.
-    None where no incidence has at least three measurements in the plane of incidence.
-    """
-    used = data.used()
-    shown, signed, channels = _in_plane(used), signed_angle(used), len(used.channels)
-    if not shown:
-        return None
-    with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(9.5, 3.0 * channels), layout="constrained")
-        grid = figure.subplots(channels, len(shown), squeeze=False, sharex="col")
-        for (channel, column), axes in np.ndenumerate(grid):
-            rows = shown[column].rows
-            rows = rows[np.argsort(signed[rows], kind="stable")]
-            angle = signed[rows]
-            low, quarter, middle, three, high = prediction.predictive.quantiles[:, rows, channel]
-            latent = prediction.latent.quantiles[2, rows, channel]
-            fill: dict[str, Any] = {"color": CYCLE[0], "linewidth": 0}
-            axes.fill_between(angle, low, high, alpha=0.2, label="95 % prediction interval", **fill)
-            axes.fill_between(angle, quarter, three, alpha=0.35, label="50 %", **fill)
-            axes.plot(angle, middle, color=CYCLE[0], linewidth=1.2, label="median")
-            axes.plot(angle, latent, color=CYCLE[1], linewidth=1.0, linestyle="dashed", label="without discrepancy")
-            axes.plot(angle, used.values[rows, channel], ".", color=INK, markersize=3, label="measurements")
-            value_axis(axes, used.values[rows], value_label(used, channel) if column == 0 else "")
-            axes.set_title("" if channel else shown[column].label)
-        figure.supxlabel(ANGLE_LABEL, fontsize="medium")
-        handles, labels = grid[0, 0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside lower center", ncols=len(labels))
+        figure.colorbar(image, ax=panels[:, :2].ravel().tolist(), label=value_label(data, 0), **bar)
+        figure.colorbar(signed, ax=panels[:, 2].tolist(), label=r"residual / $\sigma$", extend="both", **bar)
     return figure
 
 
