@@ -3,7 +3,9 @@
 Names are imported when they are first used: `import fits` loads neither arviz, matplotlib nor a solver.
 """
 
+import ast
 import importlib
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -76,55 +78,17 @@ if TYPE_CHECKING:
     from fits.structure_search import read_library as read_library
     from fits.structure_search import search as search
 
-_NAMES = {
-    "any_report": "report",
-    "batch": "FittedFiles fit_files",
-    "data.formats.csv": "write_csv",
-    "data.formats.rxt": "Slab read_slab",
-    "data.geometry": "Geometry slices",
-    "data.measurements": "Measurements",
-    "data.reading": "ReadOptions read",
-    "data.spheres": "Sphere Spheres",
-    "data.totals": "Totals",
-    "exports.export": "ExportReport export",
-    "maps.fit_map": "fit_map",
-    "maps.options": "MapOptions SpatialPrior",
-    "maps.store": "FittedMap open_map",
-    "optimise.fit": "fit",
-    "optimise.options": "FitOptions",
-    "optimise.result": "Fit",
-    "optimise.uncertainty": "Direction",
-    "prediction.average": "Average average",
-    "prediction.compare": "Comparison compare",
-    "prediction.cross_validation": "ModelScore cross_validate",
-    "prediction.importance": "Evidence evidence",
-    "prediction.options": "ComparisonOptions",
-    "prediction.predict": "Prediction Scores predict scores",
-    "problem.discrepancy": "Discrepancy",
-    "problem.instrument": "Instrument",
-    "problem.noise": "Noise",
-    "problem.parameters": "Free LogNormal LogUniform Normal PowerLaw Uniform",
-    "problem.problem": "Joint Problem",
-    "problem.simulate": "simulate",
-    "problem.stack_file": "read_problem write_problem",
-    "reports.render": "render",
-    "reports.results": "load_fit load_posterior save_fit",
-    "reports.verdicts": "ReportOptions",
-    "sampling.options": "SamplerOptions",
-    "sampling.posterior": "Mode Posterior",
-    "sampling.sample": "sample",
-    "structure_search": "Candidate Library Search SearchOptions default_library read_library search",
-}
-"""The public names of each module."""
+_IMPORTS = [node for node in ast.walk(ast.parse(Path(__file__).read_text())) if isinstance(node, ast.ImportFrom)]
+_HOMES = {name.name: str(node.module) for node in _IMPORTS for name in node.names if name.asname}
+"""The module of each public name, as the imports above say: Python does not run them, type checkers do."""
 
-_HOMES = {name: module for module, names in _NAMES.items() for name in names.split()}
 __all__ = list(_HOMES)
 
 
 def __getattr__(name: str) -> Any:
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)
+    return getattr(importlib.import_module(_HOMES[name]), name)
 
 
 def __dir__() -> list[str]:

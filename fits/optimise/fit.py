@@ -271,7 +271,6 @@ def _minima(problem: FittingProblem, at: Optimum, options: FitOptions) -> tuple[
             values=dict(zip(problem.names, map(float, ends[leader].vector), strict=True)),
             cost=float(cost[leader]),
             count=count,
-            stack=problem.build(ends[leader].vector).stack,
         )
         for leader, count in zip(leaders, counts, strict=True)
     )

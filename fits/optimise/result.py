@@ -25,12 +25,11 @@ OUTCOMES = {
 
 @dataclass(frozen=True, eq=False)
 class Minimum:
-    """A minimum that `count` starts reached: values by name, half the sum of squared residuals, and the stack."""
+    """A minimum that `count` starts reached: values by name, and half the sum of squared residuals."""
 
     values: dict[str, float]
     cost: float
     count: int
-    stack: Any
 
 
 @dataclass(frozen=True)
@@ -126,8 +125,7 @@ class Fit:
             return tuple(called[name] for name in some if name in called)
 
         def minimum(one: Minimum) -> Minimum:
-            values = {plain: one.values[whole] for whole, plain in called.items()}
-            return replace(one, values=values, stack=one.stack[name])
+            return replace(one, values={plain: one.values[whole] for whole, plain in called.items()})
 
         found = replace(
             self,

@@ -22,6 +22,7 @@ import math
 import tomllib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields
+from numbers import Real
 from pathlib import Path
 from typing import Any, Literal, cast, get_args
 
@@ -67,7 +68,7 @@ class ProblemFile:
     stack: lj.Stack | lj.Mixture
     transport: lj.Transport | Literal["auto"]
     noise: Noise
-    scale: Free | None
+    scale: float | Free | None
     objective: Objective
     instrument: Instrument | None
     options: Mapping[str, Any]
@@ -119,7 +120,7 @@ def write_problem(
     *,
     transport: lj.Transport | Literal["auto"] = "auto",
     noise: Noise | None = None,
-    scale: Free | None = None,
+    scale: float | Free | None = None,
     objective: Objective = "likelihood",
     instrument: Instrument | None = None,
     force: bool = False,
@@ -137,8 +138,9 @@ def write_problem(
     """
     require_material(stack)
     require_kind("transport", transport, lj.Transport, str)
-    for name, value, kind in (("noise", noise, Noise), ("scale", scale, Free), ("instrument", instrument, Instrument)):
-        require_kind(name, value, kind, None)
+    require_kind("noise", noise, Noise, None)
+    require_kind("scale", scale, Real, Free, None)
+    require_kind("instrument", instrument, Instrument, None)
     choice("objective", objective, get_args(Objective))
     tables = {"transport": transport_to_dict(transport), "objective": objective}
     tables = {name: value for name, value in tables.items() if value not in ("auto", "likelihood")}

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import Delaunay, QhullError, cKDTree
 
+from fits.data.geometry import direction
 from fits.data.measurements import Measurements
 from fits.data.scans import AT_NORMAL, SAME_ANGLE, in_plane, incidences, relative_azimuth, scans, signed_angle
 from fits.data.totals import Totals
@@ -27,14 +28,15 @@ def source_rows(data: Measurements) -> tuple[tuple[str, str], ...]:
     source, used, channels = data.source, int(np.count_nonzero(data.mask)), ", ".join(data.channels)
     if len(data.channels) > MOST_CHANNELS:
         channels = f"{', '.join(data.channels[:3])}, ..., {data.channels[-1]} ({len(data.channels):,} in all)"
+    rows = [("format", source.format)]
     if isinstance(data, Totals):
-        quantity, plane = "shares of the incident flux", []
-        if data.spheres is not None:
-            spheres = "two integrating spheres" if data.spheres.together else "an integrating sphere"
-            quantity = f"{quantity}, as measured with {spheres}"
+        spheres = "" if data.spheres is None else ", as measured with an integrating sphere"
+        if data.spheres is not None and data.spheres.together:
+            spheres = ", as measured with two integrating spheres"
+        rows.append(("quantity", f"shares of the incident flux{spheres}"))
     else:
-        quantity = f"{source.quantity}, converted to BRDF in 1/sr"
-        plane = [("in plane", f"{np.count_nonzero(in_plane(data))} of {len(data)}")]
+        rows.append(("quantity", f"{source.quantity}, converted to BRDF in 1/sr"))
+        rows.append(("in plane", f"{np.count_nonzero(in_plane(data))} of {len(data)}"))
     angles = [one.theta for one in incidences(data.used())]
     span = ", ".join(f"{angle:g}°" for angle in angles)
     if len(angles) > MOST_ANGLES:
@@ -44,17 +46,10 @@ def source_rows(data: Measurements) -> tuple[tuple[str, str], ...]:
         with np.errstate(divide="ignore", invalid="ignore"):
             relative = (data.sigma / np.abs(data.values))[data.mask]
         sigma = f"median {np.median(relative):.2%} of the value, {np.min(relative):.2%} to {np.max(relative):.2%}"
-    return (
-        ("format", source.format),
-        ("quantity", quantity),
-        ("measurements", f"{len(data)}, {used} used, {len(data) - used} masked"),
-        ("channels", channels),
-        *plane,
-        ("incidence", span),
-        ("sigma", sigma),
-        *(("attribution", word) for word in (source.attribution,) if word),
-        *(("note", note) for note in source.notes),
-    )
+    rows += [("measurements", f"{len(data)}, {used} used, {len(data) - used} masked"), ("channels", channels)]
+    rows += [("incidence", span), ("sigma", sigma)]
+    rows += [("attribution", source.attribution)] if source.attribution else []
+    return (*rows, *(("note", note) for note in source.notes))
 
 
 def data_table(data: Measurements) -> Table:
@@ -121,8 +116,9 @@ def data_statements(data: Measurements) -> list[str]:
         energy = f"directional albedo over the measured part of the projected hemisphere: {'; '.join(parts)}"
     if above := [f"{one.theta:g}°" for one in known if max(one.share) > 1.0]:
         energy = f"{energy}. It exceeds 1 at {', '.join(above)}: the scale is wrong"
-    repeated = repeats(data)
-    noise = "" if repeated is None else f", a noise of about {100.0 * repeated.noise:.2g} %"
+    repeated, noise = repeats(data), ""
+    if repeated is not None:  # the median of the difference of two Gaussian numbers is 0.6745 sqrt(2) sd
+        noise = f", a noise of about {100.0 * repeated.median / (0.6745 * math.sqrt(2.0)):.2g} %"
     return [
         *doubtful_angles(data),
         f"Reciprocity: {agreement('with light and viewer exchanged', reciprocity(data))}.",
@@ -140,11 +136,6 @@ class Agreement(NamedTuple):
     number: int
     median: float
     p95: float
-
-    @property
-    def noise(self) -> float:
-        """Relative standard deviation of a single measurement, for random Gaussian differences."""
-        return self.median / (0.6745 * 2.0**0.5)
 
 
 class Energy(NamedTuple):
@@ -171,17 +162,16 @@ def reciprocity(data: Measurements) -> Agreement | None:
     used = _above(data)
     if not len(used):
         return None
-    azimuth = np.radians(relative_azimuth(used))
-    side = np.where(np.abs(np.sin(azimuth)) > np.sin(np.radians(SAME_ANGLE)), np.sin(azimuth), 0.0)
+    azimuth = np.where(np.minimum(used.theta_i, used.theta_o) < AT_NORMAL, 0.0, relative_azimuth(used))
+    side = np.where(np.abs(np.sin(np.radians(azimuth))) > np.sin(np.radians(SAME_ANGLE)), azimuth, 0.0)
     both = side.min() < 0.0 < side.max()
     azimuth = azimuth if both else np.abs(azimuth)
-    # polar angles, and the azimuth between them as a point of a circle: at the normal there is none
-    size = np.where(np.minimum(used.theta_i, used.theta_o) < AT_NORMAL, 0.0, np.degrees(1.0))
-    circle = size * np.cos(azimuth), size * np.sin(azimuth)
-    places = np.column_stack([used.theta_i, used.theta_o, *circle])
-    exchanged = np.column_stack([used.theta_o, used.theta_i, circle[0], -circle[1] if both else circle[1]])
+    # the light's polar angle, and the viewer where the light stands at one azimuth
+    places = np.column_stack([used.theta_i, np.degrees(direction(used.theta_o, azimuth))])
+    exchanged = np.degrees(direction(used.theta_i, -azimuth if both else azimuth))
     rows = np.flatnonzero(np.abs(used.theta_i - used.theta_o) > SAME_ANGLE)
-    distance, nearest = cKDTree(places).query(exchanged[rows], distance_upper_bound=SAME_ANGLE)
+    tree, exchanged = cKDTree(places), np.column_stack([used.theta_o, exchanged])[rows]
+    distance, nearest = tree.query(exchanged, distance_upper_bound=SAME_ANGLE)
     found = np.isfinite(distance)
     pairs = np.unique(np.sort(np.column_stack([rows[found], nearest[found]]), axis=1), axis=0)
     return _agreement(used, *pairs[pairs[:, 0] != pairs[:, 1]].T)

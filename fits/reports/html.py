@@ -11,6 +11,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import layerjax as lj
 from fits._files import write_text
 from fits.data.measurements import Measurements
 from fits.data.totals import Totals
@@ -112,7 +113,8 @@ class FitReport:
         residuals = [one.sentence for one in verdicts.statements(facts)["residuals"]]
         residuals.append(f"Fit: {fit.status}.")
         correlation = _picture(model.correlation_picture(fit), "Correlation of the fitted parameters.")
-        stack = tomli_w.dumps(material_to_dict(fit.stack))
+        named = isinstance(fit.stack, lj.Stack | lj.Mixture)  # which the transport of a user's own need not take
+        stack = tomli_w.dumps(material_to_dict(fit.stack)) if named else str(fit.stack)
         title = f"Fit of {Path(data.source.path).name or f'{data.source.format} data'}"
         body = [
             f"<h1>{html.escape(title)}</h1>",
