@@ -68,9 +68,8 @@ class ReadOptions(FileOptions):
 
     def __post_init__(self) -> None:
         for name, high in (("min_retro_angle", 180.0), ("max_polar_angle", 90.0)):
-            if not (
-                (angle := getattr(self, name)) is None or (isinstance(angle, Real) and 0.0 <= float(angle) <= high)
-            ):
+            angle = getattr(self, name)
+            if not (angle is None or (isinstance(angle, Real) and 0.0 <= float(angle) <= high)):
                 raise ValueError(f"{name} is {angle!r:.60}, must be in [0, {high:g}] degrees")
         for name in ("select", "hold_out"):
             if not isinstance(words := getattr(self, name), list | tuple):
@@ -107,10 +106,8 @@ class ReadOptions(FileOptions):
         if isinstance(data, Totals):
             for name in ("min_retro_angle", "max_polar_angle", "select", "hold_out"):
                 if getattr(self, name):
-                    option = name.replace("_", "-")
-                    raise ValueError(
-                        f"{path}: holds totals, which have no outgoing direction; --{option} does not apply"
-                    )
+                    words = f"which have no outgoing direction; --{name.replace('_', '-')} does not apply"
+                    raise ValueError(f"{path}: holds totals, {words}")
             return data, None
         data = self._masked(data)
         kept = [select(data, words) for words in self.select if not words.startswith(CHANNELS)]

@@ -90,15 +90,13 @@ def fit(
     """
     if isinstance(stack, FittingProblem):
         problem = stack
-        arguments: dict[str, Any] = {"data": data, "noise": noise, "scale": scale, "instrument": instrument}
+        arguments = {"data": data, "noise": noise, "scale": scale, "instrument": instrument}
         arguments |= {"transport": None if transport == "auto" else transport}
         arguments |= {"objective": None if objective == "likelihood" else objective}
-        for name, given in arguments.items():
-            if given is not None:
-                raise ValueError(f"{name} is given beside a {type(stack).__name__}, which says it all")
+        if given := [name for name, value in arguments.items() if value is not None]:
+            raise ValueError(f"{given[0]} is given beside a {type(stack).__name__}, which says it all")
     else:
-        noise = Noise() if noise is None else noise
-        problem = Problem(stack, cast(Measurements, data), transport, noise, scale, objective, instrument)
+        problem = Problem(stack, cast(Measurements, data), transport, noise or Noise(), scale, objective, instrument)
     require_count("starts", starts, 1)
     require_seed(seed)
     require_switch("screen", screen)
@@ -106,8 +104,25 @@ def fit(
     require_kind("options", options, FitOptions)
     run = _Run(starts, seed, options, given_progress(progress), checkpoint, screen)
     independent = _fit_from(problem, start_points(problem, starts, seed), run)
-    before = {name: found for name in problem.problems if (found := _refuted(independent.part(name), options))}
-    return _with_discrepancy(problem, independent, before, run) if before else independent
+    without = {name: found for name in problem.problems if (found := _refuted(independent.part(name), options))}
+    if not without:
+        return independent
+
+    # again with model discrepancy of these data sets: from the minima of the fit without, and a few other points
+    sets = {name: problem.problems[name] for name in without}
+    sets = {name: replace(one, noise=replace(one.noise, discrepancy=True)) for name, one in sets.items()}
+    whole, points = problem.with_problems(sets), []
+    for minimum in independent.minima[:MOST_STARTS]:
+        values = dict(zip(whole.names, whole.start, strict=True)) | minimum.values
+        points.append(unit_of(whole, np.array([values[name] for name in whole.names])))
+    others = start_points(whole, min(starts, MOST_STARTS // 2), seed)
+
+    def progress_again(stage: str, done: int, total: int | None = None, info: str = "") -> None:
+        run.progress(f"{stage} with model discrepancy", done, total, info)
+
+    checkpoint = None if checkpoint is None else discrepancy_checkpoint(checkpoint)
+    again = run._replace(progress=progress_again, checkpoint=checkpoint)
+    return _fit_from(whole, np.concatenate([points, others]), again, without)
 
 
 def refit(problem: Problem, *vectors: Floats) -> Fit:
@@ -133,50 +148,24 @@ class _Run(NamedTuple):
     screen: bool = False
 
 
-def without_discrepancy(fit: Fit) -> WithoutDiscrepancy:
-    """What is to be said of a fit without model discrepancy."""
+def _refuted(fit: Fit, options: FitOptions) -> WithoutDiscrepancy | None:
+    """What is to be said of a fit whose residuals show that it needs model discrepancy, where that is left to them."""
+    possible = fit.problem.noise.tails == "gaussian" and fit.is_posterior and not isinstance(fit.problem.data, Totals)
+    if fit.problem.noise.discrepancy is not None or not possible:
+        return None
     pairs = neighbours(fit.problem.data.used(), fit.residuals)
+    found = correlation(*pairs)
+    if not (found * math.sqrt(pairs[0].size) > options.autocorrelation_errors and found > options.autocorrelation):
+        return None
     return WithoutDiscrepancy(
         values=fit.values,
         errors=fit.standard_errors,
         chi_square=fit.chi_square,
         degrees_of_freedom=fit.degrees_of_freedom,
         log_likelihood=fit.log_likelihood,
-        residual_autocorrelation=correlation(*pairs),
+        residual_autocorrelation=found,
         pairs=pairs[0].size,
     )
-
-
-def _refuted(independent: Fit, options: FitOptions) -> WithoutDiscrepancy | None:
-    """What is to be said of a fit whose residuals are correlated, where it is left to these; else None."""
-    problem = independent.problem
-    possible = problem.noise.tails == "gaussian" and independent.is_posterior and not isinstance(problem.data, Totals)
-    if problem.noise.discrepancy is not None or not possible:
-        return None
-    found = without_discrepancy(independent)
-    errors = found.residual_autocorrelation * math.sqrt(found.pairs)
-    clear = errors > options.autocorrelation_errors and found.residual_autocorrelation > options.autocorrelation
-    return found if clear else None
-
-
-def _with_discrepancy(
-    problem: FittingProblem, independent: Fit, before: Mapping[str, WithoutDiscrepancy], run: _Run
-) -> Fit:
-    """The fit with model discrepancy of these data sets: from the minima of that without, and a few other points."""
-    sets = {name: problem.problems[name] for name in before}
-    sets = {name: replace(one, noise=replace(one.noise, discrepancy=True)) for name, one in sets.items()}
-    whole, points = problem.with_problems(sets), []
-    for minimum in independent.minima[:MOST_STARTS]:
-        values = dict(zip(whole.names, whole.start, strict=True)) | minimum.values
-        points.append(unit_of(whole, np.array([values[name] for name in whole.names])))
-    others = start_points(whole, min(run.starts, MOST_STARTS // 2), run.seed)
-
-    def progress(stage: str, done: int, total: int | None = None, info: str = "") -> None:
-        run.progress(f"{stage} with model discrepancy", done, total, info)
-
-    checkpoint = None if run.checkpoint is None else discrepancy_checkpoint(run.checkpoint)
-    again = run._replace(progress=progress, checkpoint=checkpoint)
-    return _fit_from(whole, np.concatenate([points, others]), again, before)
 
 
 def _fit_from(

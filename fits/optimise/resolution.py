@@ -22,7 +22,8 @@ from fits.data.geometry import Floats
 from fits.optimise.levenberg_marquardt import Descent
 from fits.optimise.multi_start import Optimum, polish, rough_descent, unit_of
 from fits.optimise.options import FitOptions
-from fits.problem.instrument import rings_for
+from fits.problem.apertures import ring_counts
+from fits.problem.instrument import Instrument
 from fits.problem.model import Model
 from fits.problem.problem import FittingProblem, Problem
 from fits.progress import Progress
@@ -194,15 +195,17 @@ def leaves_rays_open(problem: Problem) -> bool:
     return has_rays(problem) and problem.instrument is not None and problem.instrument.rings is None
 
 
-def with_rings(problem: Problem, rings: int) -> Problem:
-    """The problem with so many rings of rays a cone."""
-    return replace(problem, instrument=replace(cast(Any, problem.instrument), rings=rings))
-
-
-def rings_of_lobes(problem: Problem, vector: Floats) -> int:
-    """Rings of rays a cone that the lobes of the stack ask for with this vector (P,)."""
-    parts, data = problem.build(vector), problem.data.used()
-    return rings_for(cast(Any, problem.instrument), parts.instrument, parts.stack, data.wi, data.wo)
+def with_rings(problem: Problem, vector: Floats, most: int | None = None) -> Problem:
+    """The problem with as many rings of rays a cone as its lobes ask for at this vector (P,), up to so many; no fewer
+    than it has."""
+    instrument, parts, data = cast(Instrument, problem.instrument), problem.build(vector), problem.data.used()
+    tilt = 0.0 if parts.instrument.tilt is None else abs(float(parts.instrument.tilt))
+    widths = instrument.source_aperture, instrument.detector_aperture
+    rings = max(int(np.max(ring_counts(*widths, parts.stack, data.wi, data.wo, tilt))), 1)
+    rings = rings if most is None else min(rings, most)
+    if rings <= (instrument.rings or 0):
+        return problem
+    return replace(problem, instrument=replace(instrument, rings=rings))
 
 
 # ---- refinement of an optimum ----
@@ -230,7 +233,7 @@ def for_starts(problem: FittingProblem) -> tuple[FittingProblem, dict[str, Choic
         one = problem.problems[name]
         if known is not None and known.open:
             one = replace(one, transport=known.far)
-        coarse[name] = with_rings(one, min(rings_of_lobes(one, one.start), FAR_RINGS)) if rays else one
+        coarse[name] = with_rings(one, one.start, FAR_RINGS) if rays else one
     changed = {name: one for name, one in coarse.items() if one is not problem.problems[name]}
     return problem.with_problems(changed), choices
 
@@ -274,9 +277,7 @@ def _judged(
         errors.append(error)
         note = ", as given" if not known.open else ", the finest tried" if finest else ""
     if has_rays(problem):
-        rings = rings_of_lobes(problem, vector) if choice.rays else 0
-        if rings > (cast(Any, problem.instrument).rings or 0):
-            needed = with_rings(needed, rings)
+        needed = with_rings(needed, vector) if choice.rays else needed
         other = problem.with_other_rays().predict(vector) if needed is problem else np.nan
         errors.append(float(np.max(np.abs(predicted - np.asarray(other)) / spread(problem, vector, predicted))))
     if not errors:

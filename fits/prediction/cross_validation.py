@@ -15,18 +15,16 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.special import logsumexp, softmax
 
 from fits.data.geometry import Floats
-from fits.data.measurements import Measurements
 from fits.data.scans import incidences, scans
 from fits.optimise.fit import refit
 from fits.optimise.result import Fit
-from fits.prediction.importance import Evidence, ImportanceDraws, evidence_of, posterior_draws
+from fits.prediction.importance import Evidence, ImportanceDraws, posterior_draws
 from fits.prediction.options import DEFAULT, ComparisonOptions
 from fits.prediction.predict import posterior_predictive
 from fits.problem.discrepancy import size
 from fits.problem.problem import Problem
 from fits.progress import Progress, given_progress, named
 from fits.sampling.initial import other_minima
-from fits.sampling.proposals import Density
 from layerjax._checks import require_count, require_kind, require_seed
 from layerjax.compiling import programs_kept
 
@@ -102,31 +100,17 @@ def cross_validate(
     for number, (name, rows) in enumerate(groups.items()):
         progress("cross-validation", number, len(groups), name)
         rest = refit(without(fit.problem, np.isin(np.arange(len(data)), rows)), fit.vector, *other_minima(fit))
-        density[rows], errors[number] = _predictive_density(rest, data, rows, draws, seed, options, proposal)
-        converged &= rest.converged
+        each, effective, error = np.empty((0, *data.values[rows].shape)), 0.0, math.inf
+        while not len(each) or (error > options.monte_carlo_error and len(each) < options.most_draws):
+            prediction = posterior_predictive(rest, data, draws=draws, seed=seed + len(each), proposal=proposal)
+            each = np.concatenate([each, prediction.log_densities(data.values)[:, rows]])
+            effective += prediction.effective_draws
+            density[rows] = logsumexp(each, axis=0) - math.log(len(each))
+            # how much each draw adds to the elpd, to first order
+            error = float(np.std(np.sum(np.exp(each - density[rows]), axis=(1, 2))) / math.sqrt(effective))
+        errors[number], converged = error, converged and rest.converged
     progress("cross-validation", len(groups), len(groups), "")
     return CrossValidation(tuple(groups), tuple(groups.values()), density, converged, errors)
-
-
-def _predictive_density(
-    rest: Fit,
-    data: Measurements,
-    rows: NDArray[np.int64],
-    draws: int,
-    seed: int,
-    options: ComparisonOptions,
-    proposal: Density | None,
-) -> tuple[Floats, float]:
-    """Log predictive density of these rows of the data by a fit of the rest, and the standard error of its sum."""
-    each, effective, error = np.empty((0, *data.values[rows].shape)), 0.0, math.inf
-    while not len(each) or (error > options.monte_carlo_error and len(each) < options.most_draws):
-        prediction = posterior_predictive(rest, data, draws=draws, seed=seed + len(each), proposal=proposal)
-        each = np.concatenate([each, prediction.log_densities(data.values)[:, rows]])
-        effective += prediction.effective_draws
-        density = logsumexp(each, axis=0) - math.log(len(each))
-        # how much each draw adds to the elpd, to first order
-        error = float(np.std(np.sum(np.exp(each - density), axis=(1, 2))) / math.sqrt(effective))
-    return density, error
 
 
 def require_groups(fit: Fit, options: ComparisonOptions | None = None) -> dict[str, NDArray[np.int64]]:
@@ -136,20 +120,16 @@ def require_groups(fit: Fit, options: ComparisonOptions | None = None) -> dict[s
     fit.require_posterior("cross_validate")
     if fit.problem.problems.get("") is not fit.problem:
         raise ValueError("cross_validate: it takes a fit of one measurement by itself, not a joint one")
-    groups = groups_of(fit.problem.data.used(), options or DEFAULT)
+    data, options = fit.problem.data.used(), options or DEFAULT
+    by_incidence = incidences(data)
+    groups = {one.label: one.rows for one in by_incidence}
+    if len(by_incidence) < options.min_incidences:
+        parts = [np.array_split(rows, options.scan_parts) for rows in scans(data)]
+        together = [np.concatenate(same) for same in zip(*parts, strict=True)]
+        groups = {f"part {number} of each scan": rows for number, rows in enumerate(together, 1) if rows.size}
     if len(groups) < 2:
         raise ValueError("cross_validate: there is one incidence, and too few measurements to hold some of them out")
     return groups
-
-
-def groups_of(data: Measurements, options: ComparisonOptions) -> dict[str, NDArray[np.int64]]:
-    """Rows that are held out together, by name."""
-    by_incidence = incidences(data)
-    if len(by_incidence) >= options.min_incidences:
-        return {one.label: one.rows for one in by_incidence}
-    parts = [np.array_split(rows, options.scan_parts) for rows in scans(data)]
-    together = [np.concatenate(same) for same in zip(*parts, strict=True)]
-    return {f"part {number} of each scan": rows for number, rows in enumerate(together, 1) if rows.size}
 
 
 def without(problem: Problem, held_out: ArrayLike) -> Problem:
@@ -213,7 +193,7 @@ def out_of_sample(
     require_groups(fit, options)
     draws = posterior_draws(fit)
     held_out = cross_validate(fit, options=options, progress=progress, posterior=draws)
-    return held_out, evidence_of(draws)
+    return held_out, draws.evidence
 
 
 def rank_models(

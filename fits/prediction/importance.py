@@ -30,6 +30,21 @@ DRAWS = 1000  # draws of each proposal for an evidence
 BATCH = 50  # draws that a core evaluates at a time: however many there are, one program serves
 
 
+@dataclass(frozen=True)
+class Evidence:
+    """log_evidence: natural logarithm, with data in 1/sr. error: its standard error. pareto_k: of the importance
+    weights: above 0.7 the approximation misses a part of the posterior, and the error is too small."""
+
+    log_evidence: float
+    error: float
+    pareto_k: float
+
+    @property
+    def reliable(self) -> bool:
+        """Whether the error can be trusted."""
+        return self.pareto_k < MAX_PARETO_K
+
+
 @dataclass(frozen=True, eq=False)
 class ImportanceDraws:
     """Unconstrained draws, (D, P), log weights posterior / proposal, (D,), and the Pareto k of the weights."""
@@ -43,6 +58,15 @@ class ImportanceDraws:
         """Effective sample size of the weighted draws."""
         total = logsumexp(self.log_weights)
         return float(np.exp(-logsumexp(2.0 * (self.log_weights - total)))) if np.isfinite(total) else 0.0
+
+    @property
+    def evidence(self) -> Evidence:
+        """The mean weight, if these are draws of the whole posterior."""
+        total, count = float(logsumexp(self.log_weights)), len(self.log_weights)
+        if not np.isfinite(total):
+            return Evidence(-np.inf, np.inf, np.inf)
+        relative = np.exp(self.log_weights - total) * count
+        return Evidence(total - float(np.log(count)), float(np.std(relative) / np.sqrt(count)), self.pareto_k)
 
     def suffices(self, max_pareto_k: float) -> bool:
         """Whether there are enough effective draws, with a Pareto k below this."""
@@ -137,24 +161,6 @@ def _tempered(log_weights: Floats) -> Floats:
     return scaled
 
 
-# ---- evidence ----
-
-
-@dataclass(frozen=True)
-class Evidence:
-    """log_evidence: natural logarithm, with data in 1/sr. error: its standard error. pareto_k: of the importance
-    weights: above 0.7 the approximation misses a part of the posterior, and the error is too small."""
-
-    log_evidence: float
-    error: float
-    pareto_k: float
-
-    @property
-    def reliable(self) -> bool:
-        """Whether the error can be trusted."""
-        return self.pareto_k < MAX_PARETO_K
-
-
 @broadcasting
 def evidence(fit: Fit, *, draws: int = DRAWS, seed: int = 0) -> Evidence:
     """The marginal likelihood of a fitted stack, under the priors of its parameters within their bounds.
@@ -173,19 +179,9 @@ def evidence(fit: Fit, *, draws: int = DRAWS, seed: int = 0) -> Evidence:
     require_count("draws", draws, 2)
     require_seed(seed)
     fit.require_posterior("evidence")
-    return evidence_of(posterior_draws(fit, draws, seed))
+    return posterior_draws(fit, draws, seed).evidence
 
 
 def posterior_draws(fit: Fit, draws: int = DRAWS, seed: int = 0) -> ImportanceDraws:
     """Weighted draws of a fit's posterior, of which the evidence is the mean weight."""
     return importance_draws(fit, draws, np.random.RandomState(seed), along_ridge=True)
-
-
-def evidence_of(draws: ImportanceDraws) -> Evidence:
-    """The evidence by weighted draws of the whole posterior."""
-    total = float(logsumexp(draws.log_weights))
-    if not np.isfinite(total):
-        return Evidence(-np.inf, np.inf, np.inf)
-    count = len(draws.log_weights)
-    relative = np.exp(draws.log_weights - total) * count
-    return Evidence(total - float(np.log(count)), float(np.std(relative) / np.sqrt(count)), draws.pareto_k)

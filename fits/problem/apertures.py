@@ -12,20 +12,16 @@ functions of the half vector or in the plane of incidence of what is its own mir
 from functools import cache
 from typing import Any, NamedTuple
 
-import jax
 import numpy as np
 from numpy.typing import NDArray
 
 import layerjax as lj
 from fits.data.geometry import TANGENT_COSINE, Floats
-from fits.problem.parameters import is_free
+from fits.problem.parameters import at_start, is_free
 from layerjax.mixture import stacks_of
 
 MOST_RINGS, MOST_OF_TWO = 8, 4  # rings of a cone, and of each of two
-PER_RING, AT_NONE = (
-    0.41,
-    0.16,
-)  # radius of a disc in widths of a lobe that n rings resolve: the first times n, less that
+PER_RING, AT_NONE = 0.41, 0.16  # radius of a disc, in widths of a lobe, that n rings resolve: PER_RING n - AT_NONE
 BOTH_WIDE = 1.2  # factor by which the radius of two cones together counts more than that of one
 SHIFT = 1e-3  # relative difference between a mean over a cone and its middle that does not count
 STEEPEST, LEAST = np.radians(85.0), 1e-6  # angle of a half vector at most; squared sum of two directions at least
@@ -84,9 +80,7 @@ def _narrowest(material: lj.Stack | lj.Mixture) -> tuple[float, float]:
                 facets.append(float(np.min(least)))
             elif isinstance(part, lj.Medium | lj.TurbidMedium):
                 for end in (1, 2):  # at the lower bounds of what is free, and at the upper
-                    phase = jax.tree.map(
-                        lambda x, end=end: x.arrays()[end] if is_free(x) else x, part.phase, is_leaf=is_free
-                    )
+                    phase = at_start(part.phase, end)
                     upright = isinstance(phase, lj.SGGX) and phase.kind == "surface" and phase.is_upright
                     (facets if upright else others).append(float(np.min(phase.width)))
     return min(facets), min(others)

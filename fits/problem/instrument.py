@@ -138,13 +138,6 @@ def optics_of(
     return Optics(*arrays, known)
 
 
-def rings_for(instrument: Instrument, setting: Setting, stack: Any, wi: Floats, wo: Floats) -> int:
-    """Rings of rays of a cone that the lobes of a stack ask for, none of it `Free`, along directions (N, 3) each."""
-    tilt = 0.0 if setting.tilt is None else abs(float(setting.tilt))
-    counts = ring_counts(instrument.source_aperture, instrument.detector_aperture, stack, wi, wo, tilt)
-    return max(int(np.max(counts)), 1)
-
-
 def gain_unknown(instrument: Instrument | None, wi: Floats, incidences: Floats) -> Floats:
     """Relative standard deviation, (M, 1), of the gain of light along wi (M, 3), beside incidences that have one."""
     if instrument is None or instrument.gain_sd is None:

@@ -9,7 +9,7 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
-from typing import Any, ClassVar, cast
+from typing import Any, ClassVar, Literal, cast
 
 import equinox as eqx
 import jax
@@ -287,10 +287,11 @@ def with_values(tree: Any) -> Any:
     return jax.tree.map(lambda leaf: leaf.values() if is_law(leaf) else leaf, tree, is_leaf=is_law)
 
 
-def at_start(tree: Any) -> Any:
-    """The tree with every free parameter at its start."""
-    start = jax.tree.map(lambda leaf: jnp.asarray(leaf.arrays()[0]) if is_free(leaf) else leaf, tree, is_leaf=is_free)
-    return with_values(start)
+def at_start(tree: Any, end: Literal[0, 1, 2] = 0) -> Any:
+    """The tree with every free parameter at its start; end: 1 at its lower bound, 2 at its upper one."""
+    return with_values(
+        jax.tree.map(lambda leaf: jnp.asarray(leaf.arrays()[end]) if is_free(leaf) else leaf, tree, is_leaf=is_free)
+    )
 
 
 def require_in_range(material: Any) -> None:

@@ -5,9 +5,7 @@ import sys
 import numpy as np
 
 import layerjax as lj
-from fits.data.geometry import Floats, polar
-from fits.data.geometry import Geometry as Geometry
-from fits.data.geometry import slices as slices
+from fits.data.geometry import Floats, Geometry, polar
 from fits.data.measurements import SMALLEST_SIGMA, Measurements, Source, channel_names
 from fits.problem.model import Transport, forward
 from layerjax._checks import require_kind, require_number, require_seed

@@ -7,7 +7,7 @@ import pytest
 
 from fits import Discrepancy, Free, Noise, Posterior, fit, load_fit, save_fit, slices
 from fits.optimise import multi_start as starts_module
-from fits.optimise.fit import without_discrepancy
+from fits.optimise.result import WithoutDiscrepancy
 from fits.problem.discrepancy import log_scales, places
 from fits.reports import verdicts
 from tests.helpers.models import along, line
@@ -108,7 +108,7 @@ def test_a_result_directory_keeps_it(tmp_path, coat_fit):
     problem = replace(coat_fit.problem, noise=Noise(relative=0.03, discrepancy=True))
     count, nothing = len(problem.names), {"minima": (), "alternatives": (), "unidentified": ()}
     numbers = {"vector": np.array(problem.start), "errors": np.ones(count), "covariance": np.eye(count)}
-    before = without_discrepancy(coat_fit)
+    before = WithoutDiscrepancy(coat_fit.values, coat_fit.standard_errors, 30.0, 20, 12.5, 0.4, 19)
     found = replace(coat_fit, problem=problem, **numbers, **nothing, without_discrepancy=before)
     save_fit(found, tmp_path / "result")
     again = load_fit(tmp_path / "result")
