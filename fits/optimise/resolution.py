@@ -161,27 +161,6 @@ def spread(problem: Problem, vector: Floats, predicted: Floats) -> Floats:
     return np.maximum(scatter, LEAST_SCATTER * np.sqrt(np.mean(data**2)))
 
 
-def needed_resolution(
-    known: Resolutions,
-    transport: lj.AddingDoubling,
-    error: Callable[[lj.AddingDoubling, lj.AddingDoubling], float],
-    allowed: float,
-) -> tuple[lj.AddingDoubling, float, bool]:
-    """The coarsest resolution from this one on that is fine enough, its error, and whether none is finer."""
-    finer = known.finer(transport)
-    if finer is None:
-        return transport, error(known.as_stated(transport.coarser()), transport), True
-    found = error(transport, finer)
-    while known.open and found > allowed:
-        parts = known.partly_finer(transport, finer)
-        transport = next((part for part in parts if error(part, finer) <= MINOR_SHARE * allowed), finer)
-        finer = known.finer(transport)
-        if finer is None:
-            return transport, found, True
-        found = error(transport, finer)
-    return transport, found, False
-
-
 # ---- of an instrument's cones ----
 
 
@@ -268,14 +247,21 @@ def _judged(
     """The data set at the resolution that its noise asks for, and how accurate it is now."""
     needed, errors, note = problem, [], ""
     if (known := choice.resolutions) is not None:
-        own = transport_of(problem, known)
+        transport = own = transport_of(problem, known)
         progress("numerical error", 0, None, f"at {known.in_words(own)}")
-        between = error_between(problem, own, vector, predicted)
-        transport, error, finest = needed_resolution(known, own, between, options.numerical_error)
-        if known.open and transport != own:
+        error_of, allowed = error_between(problem, own, vector, predicted), options.numerical_error
+        note, finer = "" if known.open else ", as given", known.finer(own)
+        error = error_of(known.as_stated(own.coarser()), own) if finer is None else error_of(own, finer)
+        while finer is not None and known.open and error > allowed:
+            parts = known.partly_finer(transport, finer)
+            transport = next((part for part in parts if error_of(part, finer) <= MINOR_SHARE * allowed), finer)
+            finer = known.finer(transport)
+            error = error if finer is None else error_of(transport, finer)
+        if finer is None and known.open:
+            note = ", the finest tried"
+        if transport != own:
             needed = replace(needed, transport=transport)
         errors.append(error)
-        note = ", as given" if not known.open else ", the finest tried" if finest else ""
     if has_rays(problem):
         needed = with_rings(needed, vector) if choice.rays else needed
         other = problem.with_other_rays().predict(vector) if needed is problem else np.nan

@@ -20,7 +20,7 @@ from scipy import stats
 from scipy.special import logsumexp
 
 from fits.data.geometry import Floats, Geometry
-from fits.data.measurements import TO_HAVE_THEM, Measurements, Source
+from fits.data.measurements import TO_HAVE_THEM, Measurements
 from fits.data.totals import Totals
 from fits.optimise.result import Fit
 from fits.prediction.importance import MAX_PARETO_K, importance_draws
@@ -281,11 +281,34 @@ def posterior_predictive(
     fit.require_one("predict")
     if not fit.is_posterior:
         raise ValueError(f"predict: a fit of {fit.problem.objective!r} has no noise model and predicts no measurements")
-    data, channels, noise = _measurements(fit, at), fit.problem.data.channels, fit.problem.noise
+    problem, channels, noise = fit.problem, fit.problem.data.channels, fit.problem.noise
+    if isinstance(problem.data, Totals) or isinstance(at, Totals):
+        raise ValueError("predict: Totals are not predicted; it takes a fit of BSDF values, and directions")
+    if isinstance(at, Measurements):
+        data = at.used()
+        if len(at.channels) != len(channels):
+            own, theirs = ", ".join(channels), ", ".join(at.channels)
+            raise ValueError(f"predict: the measurements have the channels {theirs}, the fit {own}")
+    else:
+        require_visible("predict", problem.stack, light=at.wi, viewer=at.wo)
+        values = np.zeros((len(at), len(channels)))  # of what refuses bad directions
+        data = Measurements(at.wi, at.wo, values, None, np.ones(len(at), bool), channels)
     vectors, pareto_k, effective = _posterior_draws(fitted, draws, np.random.default_rng(seed), proposal)
-    values = np.asarray(fit.problem.predict_at(vectors, data.wi, data.wo), float)
-    values = np.broadcast_to(values, (*values.shape[:2], len(channels)))
-    means, scales, softness, discrepancy_sd = _mixture(fit, vectors, values, data)
+    values = np.asarray(problem.predict_at(vectors, data.wi, data.wo), float)
+    means = values = np.broadcast_to(values, (*values.shape[:2], len(channels)))
+    softness, discrepancy_sd, sigma = None, None, _stated_sigma(fit, values, data.sigma)
+    relative, floor = (np.asarray(part, float)[:, None, None] for part in problem.call(_noise_levels, vectors))
+    relative = np.hypot(relative, gain_unknown(problem.instrument, data.wi, polar_angles(problem.data)))
+    if problem.model.process is None:
+        scales = np.sqrt(sigma**2 + (relative * values) ** 2 + floor**2)
+    else:
+        conditional = problem.call(_discrepancy_at, vectors, places(data.wi, data.wo))
+        discrepancy, discrepancy_sd = (np.asarray(part) for part in conditional)
+        softness = _softness(fit, np.hypot(sigma, np.median(floor)))
+        means = np.asarray(logarithm(values, softness)) + discrepancy
+        bsdf = softness * np.sinh(means)
+        spread = np.sqrt(sigma**2 + (relative * bsdf) ** 2 + floor**2) / np.asarray(size(bsdf, softness))
+        scales = np.hypot(discrepancy_sd, spread)
     return Prediction(
         wi=data.wi,
         wo=data.wo,
@@ -299,22 +322,8 @@ def posterior_predictive(
         seed=seed,
         pareto_k=pareto_k,
         effective_draws=effective,
-        measurements=at.used() if isinstance(at, Measurements) else None,
+        measurements=data if isinstance(at, Measurements) else None,
     )
-
-
-def _measurements(fit: Fit, at: Geometry | Measurements) -> Measurements:
-    if isinstance(fit.problem.data, Totals) or isinstance(at, Totals):
-        raise ValueError("predict: Totals are not predicted; it takes a fit of BSDF values, and directions")
-    channels = fit.problem.data.channels
-    if isinstance(at, Measurements):
-        if len(at.channels) != len(channels):
-            own, theirs = ", ".join(channels), ", ".join(at.channels)
-            raise ValueError(f"predict: the measurements have the channels {theirs}, the fit {own}")
-        return at.used()
-    require_visible("predict", fit.problem.stack, light=at.wi, viewer=at.wo)
-    values = np.zeros((len(at), len(channels)))
-    return Measurements(at.wi, at.wo, values, None, np.ones(len(at), bool), channels, Source("", "memory"))
 
 
 def _posterior_draws(
@@ -339,25 +348,6 @@ def _posterior_draws(
 def _resampled_size(draws: int, pool: float) -> float:
     """Effective sample size of so many draws that are taken of a pool of this one."""
     return 1.0 / (1.0 / draws + 1.0 / max(pool, 1.0))
-
-
-def _mixture(
-    fit: Fit, vectors: Floats, values: Floats, data: Measurements
-) -> tuple[Floats, Floats, Floats | None, Floats | None]:
-    """Means, scales, softness and standard deviations of the discrepancy (see `Prediction`), where draws `vectors` of
-    the posterior have these values of the stack, (D, M, C)."""
-    sigma = _stated_sigma(fit, values, data.sigma)
-    relative, floor = (np.asarray(part, float)[:, None, None] for part in fit.problem.call(_noise_levels, vectors))
-    relative = np.hypot(relative, gain_unknown(fit.problem.instrument, data.wi, polar_angles(fit.problem.data)))
-    if fit.problem.model.process is None:
-        return values, np.sqrt(sigma**2 + (relative * values) ** 2 + floor**2), None, None
-    conditional = fit.problem.call(_discrepancy_at, vectors, places(data.wi, data.wo))
-    discrepancy, discrepancy_sd = (np.asarray(part) for part in conditional)
-    softness = _softness(fit, np.hypot(sigma, np.median(floor)))
-    means = np.asarray(logarithm(values, softness)) + discrepancy
-    bsdf = softness * np.sinh(means)
-    noise = np.sqrt(sigma**2 + (relative * bsdf) ** 2 + floor**2) / np.asarray(size(bsdf, softness))
-    return means, np.hypot(discrepancy_sd, noise), softness, discrepancy_sd
 
 
 def with_discrepancy(fit: Fit, wi: Floats, wo: Floats, values: Floats) -> Floats:

@@ -184,18 +184,16 @@ def _over_disc(w: Floats, radius: float, disc: Floats) -> Floats:
     return cosine[:, None, None] * w + across[:, :1, None] * np.cross(along, w) + across[:, 1:, None] * along
 
 
-def _horizontal(w: Floats) -> Floats:
-    """Unit vectors (M, 2) of azimuths; along x at the normal."""
-    length = np.hypot(w[:, 0], w[:, 1])[:, None]
+def _horizontal(w: Floats, normal: float = 0.0) -> Floats:
+    """Unit vectors (M, 2) of azimuths; normal: the azimuth at the normal, in degrees."""
+    length, turn = np.hypot(w[:, 0], w[:, 1])[:, None], math.radians(normal)
     away = length > np.sin(np.radians(AT_NORMAL))
-    return np.where(away, w[:, :2] / np.where(away, length, 1.0), [1.0, 0.0])
+    return np.where(away, w[:, :2] / np.where(away, length, 1.0), [math.cos(turn), math.sin(turn)])
 
 
 def _forward(wi: Floats) -> Floats:
     """Towards the mirror side of light along wi (M, 3), horizontal, (M, 2); at the normal light comes as files say."""
-    away = np.hypot(wi[:, 0], wi[:, 1])[:, None] > np.sin(np.radians(AT_NORMAL))
-    turn = math.radians(LIGHT_AZIMUTH)
-    return -np.where(away, _horizontal(wi), [math.cos(turn), math.sin(turn)])
+    return -_horizontal(wi, LIGHT_AZIMUTH)
 
 
 def _tilted(w: Any, forward: Any, offset: Any) -> Array:

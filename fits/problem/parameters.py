@@ -66,7 +66,6 @@ class Normal(Prior):
         require_number("Normal.sd", self.sd, 0.0, open_ends=True)
 
     def gaussian(self) -> tuple[float, float]:
-        """Centre and inverse standard deviation."""
         return float(self.mean), 1.0 / float(self.sd)
 
 
@@ -83,7 +82,6 @@ class LogNormal(Prior):
         require_number("LogNormal.sd", self.sd, 0.0, open_ends=True)
 
     def gaussian(self) -> tuple[float, float]:
-        """Centre and inverse standard deviation of the logarithm."""
         return math.log(self.median), 1.0 / float(self.sd)
 
 
@@ -254,11 +252,13 @@ class PowerLaw(Shown):
         given = np.asarray(wavelengths, float)
         if given.ndim != 1 or given.size < 2:
             raise ValueError(f"PowerLaw.wavelengths has shape {given.shape}; it must be one a channel, two or more")
+        for name, values in (("wavelengths", given), ("reference", 1.0 if reference is None else reference)):
+            if not np.all(np.isfinite(values) & (np.asarray(values) > 0.0)):
+                raise ValueError(
+                    f"PowerLaw.{name} is {in_short(np.asarray(values).tolist())}; it must be finite and above 0"
+                )
         self.wavelengths = tuple(given.tolist())
         self.reference = float(np.exp(np.mean(np.log(given)))) if reference is None else float(reference)
-        for name, values in (("wavelengths", given), ("reference", np.array([self.reference]))):
-            if not np.all(np.isfinite(values) & (values > 0.0)):
-                raise ValueError(f"PowerLaw.{name} is {in_short(values.tolist())}; it must be finite and above 0")
         require_number_or_free("PowerLaw.amplitude", amplitude, 0.0, math.inf)
         require_number_or_free("PowerLaw.exponent", exponent, -math.inf, math.inf)
         if not (is_free(amplitude) or is_free(exponent)):

@@ -112,7 +112,6 @@ class FitReport:
 
         residuals = [one.sentence for one in verdicts.statements(facts)["residuals"]]
         residuals.append(f"Fit: {fit.status}.")
-        correlation = _picture(model.correlation_picture(fit), "Correlation of the fitted parameters.")
         named = isinstance(fit.stack, lj.Stack | lj.Mixture)  # which the transport of a user's own need not take
         stack = tomli_w.dumps(material_to_dict(fit.stack)) if named else str(fit.stack)
         title = f"Fit of {Path(data.source.path).name or f'{data.source.format} data'}"
@@ -123,7 +122,7 @@ class FitReport:
             section("Values", tables.parameter_table(fit, both=True), f"<pre>{html.escape(stack)}</pre>"),
             section("Data and model", *compared),
             section("Diagnostics", residuals, tables.incidence_table(fit), tables.minima_table(fit)),
-            section("Identifiability", [identified], tables.unidentified_table(fit), correlation),
+            section("Identifiability", [identified], tables.unidentified_table(fit), tables.correlation_table(fit)),
             section("Posterior", *sampling),
         ]
         if self.others:

@@ -19,22 +19,16 @@ from layerjax.mixture import require_material, stacks_of
 
 Prepared = lj.Prepared | lj.Mixture
 
-
+# towards the light: x to the right, y up, z towards the viewer
 LIGHTS = {
     "lit from the front": (-0.4, 0.5, 0.77),
     "from the side": (-0.85, 0.35, 0.1),
     "from behind": (0.5, 0.45, -0.74),
 }
-"""Towards the light: x to the right, y up, z towards the viewer."""
-
-SUN, SKY = 0.8, 0.2
-"""What a white diffuse surface shows of the light at normal incidence, and of the sky, which is all around."""
-
-SAMPLES, SKY_COSINES, SKY_AZIMUTHS = 2, 24, 24
-"""Points along each side of a pixel, and directions at which the reflected sky is tabulated."""
-
-INCIDENT, OUTGOING = np.linspace(0.0, 90.0, 91), np.linspace(-90.0, 90.0, 181)
-"""Edges of the cells of the map of the BSDF, degrees."""
+SUN, SKY = 0.8, 0.2  # what a white diffuse surface shows of the light at normal incidence, and of the sky all around
+SAMPLES = 2  # points along each side of a pixel
+SKY_COSINES, SKY_AZIMUTHS = 24, 24  # directions at which the reflected sky is tabulated
+INCIDENT, OUTGOING = np.linspace(0.0, 90.0, 91), np.linspace(-90.0, 90.0, 181)  # edges of cells of the BSDF's map
 
 
 def render(
@@ -65,10 +59,8 @@ def render(
     for part in stacks_of(stack):
         indices = [float(layer.ior) for layer in part.layers if isinstance(layer, lj.Interface)]
         if part.base is None and indices and indices[-1] != 1.0:
-            raise ValueError(
-                f"layers: the stack ends in a medium of index {indices[-1]:g}, and the picture is of a sheet in air: "
-                "close it with an Interface of ior 1, or give it a base"
-            )
+            words = "the picture is of a sheet in air: close it with an Interface of ior 1, or give it a base"
+            raise ValueError(f"layers: the stack ends in a medium of index {indices[-1]:g}, and {words}")
     chosen = lj.AddingDoubling() if transport is None else transport
     if isinstance(chosen, lj.Transport) and chosen.random:
         raise ValueError(f"transport: {type(chosen).__name__} is random; use a deterministic one: AddingDoubling()")
@@ -91,15 +83,10 @@ def render(
 
 
 def sphere(stack: lj.Stack | lj.Mixture, prepared: Prepared, light: tuple[float, float, float], size: int) -> Floats:
-    """Radiance of the pixels, (size, size, 3), linear.
+    """Radiance of the pixels of a sphere, (size, size, 3), linear, each the mean of `SAMPLES` by `SAMPLES` points.
 
     An irradiance of pi `SUN` across the light, a sky of radiance `SKY`, a viewer far away, and a picture 1.04 times as
-    wide as the sphere.
-
-    Args:
-        stack, prepared: the material, and what `layerjax.prepare` made of it.
-        light: towards it, of any length: x to the right, y up, z towards the viewer.
-        size: pixels along each side, each the mean of `SAMPLES` by `SAMPLES` points.
+    wide as the sphere. light: towards it, of any length, as in `LIGHTS`.
     """
     number = SAMPLES * size
     place = ((np.arange(number) + 0.5) / number * 2.0 - 1.0) * 1.04

@@ -12,7 +12,6 @@ report.html    the report, pictures inside
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, fields, replace
-from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -38,6 +37,7 @@ from fits.optimise.result import Fit, Minimum, WithoutDiscrepancy
 from fits.optimise.uncertainty import Direction
 from fits.problem.problem import Problem
 from fits.problem.stack_file import read_problem, transport_from_dict, transport_to_dict, write_problem
+from fits.reports.pages import versions
 from layerjax import Transport
 from layerjax._checks import require_kind
 
@@ -48,7 +48,6 @@ SCHEMA = 6
 FIT, HELD_OUT, REPORT, SUMMARY, LOCK = "fit.json", "held_out.csv", "report.html", "summary.json", "chain.db.lock"
 DATA, PROBLEM, FITTED, CHAIN = "data.csv", "problem.toml", "fitted.toml", "chain.db"
 _FIELDS = [one.name for one in fields(Fit) if one.name not in ("problem", "alternatives", "without_discrepancy_parts")]
-PACKAGES = ("jax", "equinox", "optimistix", "emcee", "numpy", "scipy")
 
 
 # ---- fits ----
@@ -123,6 +122,18 @@ def load_fit(directory: str | Path) -> Fit:
         if text_checksum(directory / name) != content.get("checksums", {}).get(name):
             raise ValueError(f"{directory / name}: damaged or changed since the fit, its checksum is not that in {FIT}")
     try:
+        # the problem: stack file and data, with what the fit chose beside them
+        given, data, spheres = read_problem(directory / PROBLEM), read(directory / DATA), content["spheres"]
+        data = replace(data, source=Source(**content["source"] | {"notes": tuple(content["source"]["notes"])}))
+        if isinstance(data, Totals) and spheres is not None:
+            both = ("reflection", "transmission")
+            spheres |= {name: None if spheres[name] is None else Sphere(**spheres[name]) for name in both}
+            data = replace(data, spheres=Spheres(**spheres))
+        added = content["fit"]["without_discrepancy"] is not None
+        noise = replace(given.noise, discrepancy=True) if added else given.noise
+        transport = transport_from_dict(content["transport"])
+        problem = Problem(given.stack, data, transport, noise, given.scale, given.objective, given.instrument)
+        # its numbers
         stored = {name: _restored(content["fit"][name]) for name in _FIELDS}
         stored |= {name: np.array(stored[name], float) for name in ("vector", "errors", "covariance")}
         stored["unidentified"] = tuple(Direction(**one) for one in stored["unidentified"])
@@ -130,23 +141,9 @@ def load_fit(directory: str | Path) -> Fit:
             stored["without_discrepancy"] = WithoutDiscrepancy(**stored["without_discrepancy"])
         stored["minima"] = tuple(Minimum(**one) for one in stored["minima"])
         alternatives = tuple(stored["minima"][index] for index in content["alternatives"])
-        return Fit(problem=_problem(directory, content), alternatives=alternatives, **stored)
+        return Fit(problem=problem, alternatives=alternatives, **stored)
     except (LookupError, TypeError, AttributeError) as error:
         raise ValueError(f"{directory / FIT}: damaged, it is not what `save_fit` writes") from error
-
-
-def _problem(directory: Path, content: dict[str, Any]) -> Problem:
-    """The fitting problem: the stack file and the data, with what the fit chose beside them."""
-    given, data, spheres = read_problem(directory / PROBLEM), read(directory / DATA), content["spheres"]
-    data = replace(data, source=Source(**content["source"] | {"notes": tuple(content["source"]["notes"])}))
-    if isinstance(data, Totals) and spheres is not None:
-        both = ("reflection", "transmission")
-        spheres |= {name: None if spheres[name] is None else Sphere(**spheres[name]) for name in both}
-        data = replace(data, spheres=Spheres(**spheres))
-    added = content["fit"]["without_discrepancy"] is not None
-    noise = replace(given.noise, discrepancy=True) if added else given.noise
-    transport = transport_from_dict(content["transport"])
-    return Problem(given.stack, data, transport, noise, given.scale, given.objective, given.instrument)
 
 
 def _restored(value: Any) -> Any:
@@ -212,13 +209,6 @@ def save_posterior(posterior: "Posterior", directory: str | Path) -> None:
         },
     }
     write_json(Path(directory) / SUMMARY, content, force=True)
-
-
-def versions() -> dict[str, str]:
-    """Versions of the packages that a result depends on."""
-    import layerjax
-
-    return {"layerjax": layerjax.__version__} | {package: metadata.version(package) for package in PACKAGES}
 
 
 # ---- directories ----

@@ -165,6 +165,15 @@ def unidentified_table(fit: "Fit") -> Table:
     return Table(f"{kind} directions of parameter space", columns, tuple(rows), note)
 
 
+def correlation_table(fit: "Fit") -> Table:
+    """Correlations of the fitted parameters, which are numbered."""
+    rows = []
+    for number, (name, correlations) in enumerate(zip(fit.values, fit.correlation, strict=True)):
+        words = [f"{value:+.2f}" if math.isfinite(value) else "" for value in correlations[:number]]
+        rows.append((f"{name} ({number + 1})", *words, *[""] * (len(fit.values) - 1 - number)))
+    return Table("Correlations", ("", *map(str, range(1, len(rows)))), tuple(rows))
+
+
 def posterior_table(posterior: "Posterior") -> Table:
     """Median, 68 % interval, standard deviation, unit and effective sample size of each parameter."""
     effective = np.broadcast_to(posterior.effective_samples, len(posterior.names))

@@ -29,20 +29,20 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ReportOptions:
-    """Thresholds that decide what a report says."""
+    """Thresholds that decide what a report says.
+
+    Attributes:
+        significance: standard errors from which a chi-square, or a correlation of residuals, is not chance.
+        misfit: median misfit, in standard deviations of the stated noise, above which a significant misfit means that
+            the stack does not describe the sample; that of the true stack is 0.67.
+        correlated: absolute correlation from which the table of parameters names the partner of a parameter.
+        prior_dominated: standard error, as a share of the bounds, above which a parameter is called prior-dominated.
+    """
 
     significance: float = 3.0
-    """Standard errors from which a chi-square, or a correlation of residuals, is not chance."""
-
     misfit: float = 1.5
-    """Median misfit, in standard deviations of the stated noise, above which a significant misfit means that the stack
-    does not describe the sample; that of the true stack is 0.67."""
-
     correlated: float = 0.95
-    """Absolute correlation from which the table of parameters names the partner of a parameter."""
-
     prior_dominated: float = 0.3
-    """Standard error, as a share of the bounds, above which a parameter is called prior-dominated."""
 
     def __post_init__(self) -> None:
         for field in fields(self):
@@ -349,12 +349,10 @@ def _remarks(f: Assessment) -> list[Statement]:
         term, without = f.discrepancy
         amplitude, exponent = 100.0 * float(term.amplitude), float(term.grazing_exponent)
         grazing = f" at normal incidence, {amplitude * 2.0**exponent:.2g} % at 60°" if exponent > 0.0 else ""
-        lengths = (
-            f"{float(term.length_half):.2g}° (half angle), {float(term.length_difference):.2g}° (difference angle)"
-        )
-        words = f"Model discrepancy: {amplitude:.2g} % of the BSDF{grazing}; length scales {lengths}."
-        words = f"{words} The reduced chi-square is {f.ratio:.3g} with it and {without:.3g} without."
-        remarks.append(Statement(words))
+        half, difference = float(term.length_half), float(term.length_difference)
+        words = f"length scales {half:.2g}° (half angle), {difference:.2g}° (difference angle)"
+        words = f"Model discrepancy: {amplitude:.2g} % of the BSDF{grazing}; {words}. The reduced chi-square is"
+        remarks.append(Statement(f"{words} {f.ratio:.3g} with it and {without:.3g} without."))
     if not f.resolved:
         error = numerical_error_in_words(f.numerical_error)
         remarks.append(Statement(f"The numerical error of the model is {error}: a finer resolution may change values."))
@@ -428,22 +426,19 @@ def sampled(posterior: "Posterior") -> list[str]:
         f"{posterior.acceptance:.0%} of the proposals were accepted; R-hat is at most {worst:.3f}.",
     ]
     if posterior.modes:
-        places = [
-            f"{100.0 * mode.share:.2g} ± {100.0 * mode.error:.1g} % at "
-            + ", ".join(f"{name} {value:.4g}" for name, value in mode.values.items())
-            for mode in posterior.modes
-        ]
+        places = []
+        for mode in posterior.modes:
+            values = ", ".join(f"{name} {value:.4g}" for name, value in mode.values.items())
+            places.append(f"{100.0 * mode.share:.2g} ± {100.0 * mode.error:.1g} % at {values}")
         words.append(f"The posterior has {len(places)} modes: {'; '.join(places)}. Estimates cover all of them.")
         if worst > options.r_hat:
             words.append(f"R-hat is above {options.r_hat:g}: the shares of the modes are uncertain.")
     if posterior.status:
         words.append(f"The sampler: {posterior.status}.")
     if not posterior.converged:
-        words.append(
-            f"The chain has not converged: {options.autocorrelation_times:g} autocorrelation times and R-hat of at "
-            f"most {options.r_hat:g} are needed: "
-            + ("do not quote these estimates." if reportable(posterior) else "it gives no estimates yet.")
-        )
+        needed = f"{options.autocorrelation_times:g} autocorrelation times and R-hat of at most {options.r_hat:g}"
+        what = "do not quote these estimates" if reportable(posterior) else "it gives no estimates yet"
+        words.append(f"The chain has not converged: {needed} are needed: {what}.")
     return words
 
 

@@ -239,20 +239,3 @@ def corner_picture(posterior: "Posterior") -> Figure:
             quiet=bool(posterior.modes),  # of modes narrower than a bin there are no contours
         )
     return figure
-
-
-def correlation_picture(fit: "Fit") -> Figure:
-    """The correlation matrix of the fitted parameters, with its numbers."""
-    names, matrix = list(fit.values), np.round(fit.correlation, 2)
-    side = float(np.clip(0.75 * len(names) + 2.0, 3.5, 9.0))
-    with mpl.rc_context(STYLE | {"axes.grid": False}):
-        figure = Figure(figsize=(side + 0.8, side), layout="constrained")
-        axes = figure.subplots()
-        image = axes.imshow(matrix, cmap="PuOr", vmin=-1.0, vmax=1.0)
-        axes.set_xticks(range(len(names)), names, rotation=40, ha="right", rotation_mode="anchor")
-        axes.set_yticks(range(len(names)), names)
-        for (row, column), value in np.ndenumerate(matrix):
-            colour = "white" if abs(value) > 0.6 else INK
-            axes.text(column, row, f"{value + 0.0:.2f}", ha="center", va="center", fontsize=8, color=colour)
-        figure.colorbar(image, ax=axes, label="correlation", shrink=0.8)
-    return figure

@@ -45,7 +45,9 @@ def test_the_report_holds_everything(coat_fit: Fit, tmp_path: Path) -> None:
         assert word in text, word
     assert "<coat>" not in text
     pictured = re.findall(r'src="([^"]{30})', text)
-    assert len(pictured) == 4  # curves, maps, correlation, comparison
+    assert len(pictured) == 3  # curves, maps, comparison
+    (correlation,) = re.findall(r"<td>base.albedo \(2\)</td><td class=.number.>([-+.\d]+)", text)
+    assert float(correlation) == pytest.approx(coat_fit.correlation[1, 0], abs=0.005)
     assert all(start.startswith("data:image/png;base64,") for start in pictured)
     assert "http" not in re.sub(r"base64,[^\"]*", "", text)
     with pytest.raises(ValueError, match="exists"):  # it replaces an earlier one only by force
