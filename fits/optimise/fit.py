@@ -90,7 +90,7 @@ def fit(
     """
     if isinstance(stack, FittingProblem):
         problem = stack
-        arguments = {"data": data, "noise": noise, "scale": scale, "instrument": instrument}
+        arguments: dict[str, Any] = {"data": data, "noise": noise, "scale": scale, "instrument": instrument}
         arguments |= {"transport": None if transport == "auto" else transport}
         arguments |= {"objective": None if objective == "likelihood" else objective}
         if given := [name for name, value in arguments.items() if value is not None]:

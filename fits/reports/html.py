@@ -9,13 +9,19 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
+
+import tomli_w
+from matplotlib.figure import Figure
 
 import layerjax as lj
 from fits._files import write_text
 from fits.data.measurements import Measurements
 from fits.data.totals import Totals
+from fits.optimise.result import Fit
 from fits.optimise.uncertainty import UNIDENTIFIED_BEYOND
+from fits.prediction.compare import Comparison, compare, fits_of
+from fits.prediction.predict import Prediction, predict
+from fits.problem.stack_file import material_to_dict
 from fits.reports import tables, verdicts
 from fits.reports.data_summary import source_rows
 from fits.reports.pages import Part, Table, document, html_table, image, made_with, section, sentences, verdict
@@ -23,37 +29,28 @@ from fits.reports.plots import model
 from fits.reports.plots.data import as_png, totals_picture
 from fits.reports.results import REPORT
 from fits.reports.verdicts import ReportOptions, reportable
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-    from fits.optimise.result import Fit
-    from fits.prediction.compare import Comparison
-    from fits.prediction.predict import Prediction
-    from fits.sampling.posterior import Posterior
+from fits.sampling.posterior import Posterior
 
 
 @dataclass(frozen=True, eq=False)
 class FitReport:
     """What the report of a fit is made of; arguments as of `fits.report`."""
 
-    fit: "Fit"
-    posterior: "Posterior | None" = None
-    others: Mapping[str, "Fit | Posterior"] = field(default_factory=dict)
+    fit: Fit
+    posterior: Posterior | None = None
+    others: Mapping[str, Fit | Posterior] = field(default_factory=dict)
     name: str = "this fit"
     held_out: Measurements | None = None
     options: ReportOptions = verdicts.DEFAULT
 
     @property
-    def estimates(self) -> "Posterior | None":
+    def estimates(self) -> Posterior | None:
         """The posterior, if there are estimates of it."""
         return self.posterior if self.posterior is not None and reportable(self.posterior) else None
 
     @cached_property
-    def predicted(self) -> "Prediction | None":
+    def predicted(self) -> Prediction | None:
         """The prediction of held-out data; None without any."""
-        from fits.prediction.predict import predict
-
         return None if self.held_out is None else predict(self.estimates or self.fit, self.held_out)
 
     def write(self, folder: Path) -> None:
@@ -62,10 +59,6 @@ class FitReport:
 
     def page(self) -> str:
         """The HTML text, with the pictures inside."""
-        import tomli_w
-
-        from fits.problem.stack_file import material_to_dict
-
         fit, data = self.fit, self.fit.problem.data
         facts = verdicts.assess(fit, self.options)
         opening = verdicts.verdict(fit, facts)
@@ -87,9 +80,7 @@ class FitReport:
             compared.append(_picture(model.maps_picture(fit), caption))
         if self.held_out is not None and self.predicted is not None:
             compared.append(tables.scores_table(self.predicted, self.held_out, "Held-out data"))
-            caption = (
-                "Held-out data in the plane of incidence, and their prediction; residuals in its standard deviations."
-            )
+            caption = "Held-out data in the plane of incidence, and their prediction; sigma: that of the prediction."
             compared.append(_picture(model.prediction_picture(self.predicted, self.held_out), caption))
 
         # what the data identify
@@ -126,8 +117,6 @@ class FitReport:
             section("Posterior", *sampling),
         ]
         if self.others:
-            from fits.prediction.compare import compare, fits_of
-
             found = compare({self.name: self.estimates or fit, **self.others})
             picture = _picture(
                 model.curves_picture({self.name: fit, **fits_of(self.others)}), "The fits beside the data."
@@ -136,14 +125,14 @@ class FitReport:
         return document(title, [*body, made_with()])
 
 
-def _picture(figure: "Figure | None", caption: str) -> str:
+def _picture(figure: Figure | None, caption: str) -> str:
     return "" if figure is None else image(as_png(figure), caption)
 
 
 # In a notebook: results lie below reports and do not import them, but call these functions when they are shown.
 
 
-def fit_fragment(fit: "Fit") -> str:
+def fit_fragment(fit: Fit) -> str:
     """The verdict on a fit, values with errors and units, and unidentified directions; of a `Joint`, by data set."""
     fragments = []
     for name in fit.problem.problems:
@@ -158,13 +147,13 @@ def fit_fragment(fit: "Fit") -> str:
     return "".join(fragments)
 
 
-def posterior_fragment(posterior: "Posterior") -> str:
+def posterior_fragment(posterior: Posterior) -> str:
     """How far the chain has converged, and its estimates, if there are any."""
     table = html_table(tables.posterior_table(posterior)) if reportable(posterior) else ""
     return _paragraph(verdicts.sampled(posterior)) + table
 
 
-def comparison_fragment(comparison: "Comparison") -> str:
+def comparison_fragment(comparison: Comparison) -> str:
     """Which of several fits predicts the data best, and by how much."""
     return _paragraph([comparison.verdict]) + html_table(tables.comparison_table(comparison))
 

@@ -65,8 +65,8 @@ def render(
     if isinstance(chosen, lj.Transport) and chosen.random:
         raise ValueError(f"transport: {type(chosen).__name__} is random; use a deterministic one: AddingDoubling()")
     prepared = lj.prepare(stack, chosen)
-    maps = _maps(prepared, any(part.base is None for part in stacks_of(stack)))
-    lights = [name for name in LIGHTS if "transmitted" in maps or name != "from behind"]
+    transmits = any(part.base is None for part in stacks_of(stack))
+    lights = [name for name in LIGHTS if transmits or name != "from behind"]
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(10.5, 7.2), layout="constrained")
         if title:
@@ -77,8 +77,8 @@ def render(
             axes.set_title(name)
             axes.set_axis_off()
         left, right = np.ravel(below.subfigures(1, 2, width_ratios=(1.0, 1.25), squeeze=False))
-        _lobes(left.subplots(subplot_kw={"projection": "polar"}), prepared, "transmitted" in maps)
-        _draw_maps(right, maps)
+        _lobes(left.subplots(subplot_kw={"projection": "polar"}), prepared, transmits)
+        _maps(right, prepared, transmits)
     return figure
 
 
@@ -143,24 +143,21 @@ def _lobes(axes: Axes, prepared: Prepared, transmits: bool) -> None:
     axes.legend(title="incidence", loc="lower left", bbox_to_anchor=(-0.3, -0.05))
 
 
-def _maps(prepared: Prepared, open_below: bool) -> dict[str, Floats]:
-    """The BSDF in the plane of incidence, (incident, outgoing) angles, of each side to which any light goes."""
+def _maps(figure: SubFigure, prepared: Prepared, transmits: bool) -> None:
+    """The BSDF by incident and outgoing angle in the plane of incidence, a map for each side to which light goes.
+
+    Colours are of the values below 75 degrees, four decades at most.
+    """
     incident, outgoing = (np.radians(0.5 * (edges[1:] + edges[:-1])) for edges in (INCIDENT, OUTGOING))
-    wi, sides = lj.direction(-incident, 0.0)[:, None], {"reflected": lj.direction(outgoing, 0.0)}
-    if open_below:
-        sides["transmitted"] = lj.direction(np.pi - outgoing, 0.0)
-    maps = {name: np.asarray(lj.evaluate(prepared, wi, wo)).mean(axis=-1) for name, wo in sides.items()}
-    return {name: values for name, values in maps.items() if name == "reflected" or np.any(values > 0)}
-
-
-def _draw_maps(figure: SubFigure, maps: dict[str, Floats]) -> None:
-    """Incident by outgoing angle, one map for each side; colours over the values off grazing, four decades at most."""
-    inner = [values[:75, 15:-15] for values in maps.values()]  # below 75 degrees
+    below = np.where(outgoing > 0.0, np.pi, -np.pi) - outgoing
+    sides = {"reflected": outgoing} | ({"transmitted": below} if transmits else {})
+    wi, panels = lj.direction(-incident, 0.0)[:, None], figure.subplots(len(sides), 1, sharex=True, squeeze=False)[:, 0]
+    maps = [np.asarray(lj.evaluate(prepared, wi, lj.direction(side, 0.0))).mean(axis=-1) for side in sides.values()]
+    inner = [values[:75, 15:-15] for values in maps]
     largest = max(float(values.max()) for values in inner) or 1.0
     least = max(min(float(values.min()) for values in inner), 1e-4 * largest)
     norm = LogNorm(min(least, 0.5 * largest), largest)
-    panels = figure.subplots(len(maps), 1, sharex=True, squeeze=False)[:, 0]
-    for axes, (name, values) in zip(panels, maps.items(), strict=True):
+    for axes, name, values in zip(panels, sides, maps, strict=True):
         within = np.clip(values, norm.vmin, norm.vmax)
         image = axes.pcolormesh(OUTGOING, INCIDENT, within, norm=norm, cmap="viridis", rasterized=True)
         axes.set(ylabel="incidence, degrees", title=f"BSDF in the plane of incidence, {name}")

@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 import numpy as np
 
@@ -38,11 +38,10 @@ from fits.optimise.uncertainty import Direction
 from fits.problem.problem import Problem
 from fits.problem.stack_file import read_problem, transport_from_dict, transport_to_dict, write_problem
 from fits.reports.pages import versions
+from fits.sampling.posterior import Posterior
+from fits.sampling.sample import NoSteps, load
 from layerjax import Transport
 from layerjax._checks import require_kind
-
-if TYPE_CHECKING:
-    from fits.sampling.posterior import Posterior
 
 SCHEMA = 6
 FIT, HELD_OUT, REPORT, SUMMARY, LOCK = "fit.json", "held_out.csv", "report.html", "summary.json", "chain.db.lock"
@@ -164,7 +163,7 @@ def load_held_out(directory: str | Path) -> Measurements | None:
 # ---- posteriors ----
 
 
-def load_posterior(directory: str | Path) -> "Posterior | None":
+def load_posterior(directory: str | Path) -> Posterior | None:
     """The posterior that was sampled in a result directory, as far as it got; None before its first step.
 
     Its estimates are refused where the chain is too short, unless it was saved as one to be reported all the same.
@@ -173,8 +172,6 @@ def load_posterior(directory: str | Path) -> "Posterior | None":
         FileNotFoundError: there is no such directory.
         ValueError: on one line, for a damaged file.
     """
-    from fits.sampling.sample import NoSteps, load
-
     directory = given_path("directory", directory)
     require_there(directory, "no such directory")
     if not (directory / CHAIN).is_file():
@@ -188,7 +185,7 @@ def load_posterior(directory: str | Path) -> "Posterior | None":
     return replace(posterior, allow_unconverged=allowed)  # not by a summary of a longer chain, which has been replaced
 
 
-def save_posterior(posterior: "Posterior", directory: str | Path) -> None:
+def save_posterior(posterior: Posterior, directory: str | Path) -> None:
     """Writes the estimates beside the chain that `fits.sample` keeps in the directory.
 
     Raises:

@@ -9,22 +9,21 @@ by the fitted covariance.
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from fits.data.scans import correlation, neighbours
-from fits.optimise.limits import instrument_limits
+import layerjax as lj
+from fits.data.measurements import Measurements
+from fits.data.scans import correlation, in_plane, neighbours, scans, signed_angle
 from fits.optimise.options import FitOptions
-from fits.optimise.result import numerical_error_in_words
+from fits.optimise.result import Fit, numerical_error_in_words
 from fits.optimise.uncertainty import UNCONSTRAINED_BEYOND, UNIDENTIFIED_BEYOND, Direction
 from fits.problem.model import Model
 from fits.problem.noise import DEFAULT_RELATIVE
+from fits.sampling.posterior import Posterior
 from layerjax._checks import require_number
-
-if TYPE_CHECKING:
-    from fits.optimise.result import Fit
-    from fits.sampling.posterior import Posterior
+from layerjax.mixture import stacks_by_name
 
 
 @dataclass(frozen=True)
@@ -60,7 +59,7 @@ NOISE_ASSUMED = (
 # ---- residuals ----
 
 
-def over_all_rows(fit: "Fit", values: np.ndarray) -> np.ndarray:
+def over_all_rows(fit: Fit, values: np.ndarray) -> np.ndarray:
     """Values (used samples, C) of a fit spread over every row of its data, (N, C); NaN in rows that were not used."""
     mask = fit.problem.data.mask
     spread = np.full((len(mask), np.shape(values)[1]), np.nan)
@@ -68,7 +67,7 @@ def over_all_rows(fit: "Fit", values: np.ndarray) -> np.ndarray:
     return spread
 
 
-def standardised(fit: "Fit") -> np.ndarray:
+def standardised(fit: Fit) -> np.ndarray:
     """Residuals of every row that are independent standard normal if the model holds, (N, C); NaN in unused rows.
 
     They are in units of the noise; with a model discrepancy, whitened by the covariance of both.
@@ -76,9 +75,52 @@ def standardised(fit: "Fit") -> np.ndarray:
     return over_all_rows(fit, fit.residuals / residual_unit(fit))
 
 
-def residual_unit(fit: "Fit") -> float:
+def residual_unit(fit: Fit) -> float:
     """Noise, or the scatter that is left where a named objective has no noise model."""
     return 1.0 if fit.is_posterior else math.sqrt(fit.chi_square / max(fit.degrees_of_freedom, 1))
+
+
+# ---- what an instrument does not resolve ----
+
+# tangent of the half vector, over alpha, at which facets are half as many as along the normal
+HALF = {"ggx": math.sqrt(math.sqrt(2.0) - 1.0), "vmf": math.sqrt(math.log(2.0))}
+STEPS = 2.0  # of a scan, that a lobe has to hold within its full width at half maximum
+NEAR = 10.0  # degrees from the mirror direction within which steps of a scan count
+
+
+def instrument_limits(fit: Fit) -> dict[str, float]:
+    """Fitted roughnesses whose lobe is narrower than what can be seen of it, and the least alpha that could be.
+
+    A mirror lobe is as wide as its full width at half maximum, in the angle of the viewer. That has to be wider than
+    the aperture of the `Instrument`, and hold two steps of the scan that is finest about the mirror direction.
+    """
+    instrument, material, found = fit.problem.instrument, fit.problem.stack, {}
+    aperture = 0.0 if instrument is None else math.hypot(instrument.source_aperture, instrument.detector_aperture)
+    resolved = max(aperture, STEPS * finest_step(fit.problem.data.used()))
+    for prefix, stack in stacks_by_name(material).items() if isinstance(material, lj.Stack | lj.Mixture) else ():
+        parts = {f"{prefix}layers[{place}].alpha": layer for place, layer in enumerate(stack.layers)}
+        for name, part in (parts | {f"{prefix}base.alpha": stack.base}).items():
+            if isinstance(part, lj.Interface | lj.Conductor) and name in fit.values:
+                least = math.tan(math.radians(resolved / 4.0)) / HALF[part.distribution]
+                found |= {name: least} if fit.values[name] < least else {}
+    return found
+
+
+def finest_step(data: Measurements) -> float:
+    """Degrees between neighbours about the mirror direction, of the scan that is finest there; 0 if none crosses it."""
+    signed, plane = signed_angle(data), in_plane(data)
+    steps = []
+    for rows in scans(data):
+        rows = rows[plane[rows]]
+        angle, mirror = signed[rows], float(data.theta_i[rows[0]]) if rows.size else 0.0
+        if rows.size < 2 or not angle.min() <= mirror <= angle.max():
+            continue
+        gaps = np.diff(angle)
+        middle = 0.5 * (angle[1:] + angle[:-1])
+        near = (np.abs(middle - mirror) <= NEAR) & (gaps > 0.0)
+        if near.any():
+            steps.append(float(np.min(gaps[near])))
+    return min(steps, default=0.0)
 
 
 # ---- facts ----
@@ -145,7 +187,7 @@ class Assessment:
         return all(word == IDENTIFIED or word.startswith(CORRELATED) for word in self.physical.values())
 
 
-def assess(fit: "Fit", options: ReportOptions = DEFAULT) -> Assessment:
+def assess(fit: Fit, options: ReportOptions = DEFAULT) -> Assessment:
     """The facts of a fit."""
     used, likelihood, freedom = fit.problem.data.used(), fit.is_posterior, max(fit.degrees_of_freedom, 1)
     spread = math.sqrt(2.0 / freedom)  # of chi-square per degree of freedom about 1
@@ -197,7 +239,7 @@ def assess(fit: "Fit", options: ReportOptions = DEFAULT) -> Assessment:
 IDENTIFIED, CORRELATED = "identified", "correlated with"
 
 
-def identifiability(fit: "Fit", options: ReportOptions = DEFAULT) -> dict[str, str]:
+def identifiability(fit: Fit, options: ReportOptions = DEFAULT) -> dict[str, str]:
     """What the data say of each parameter, in a few words; directions count from 1, worst first.
 
     What counts is a parameter's own error along the unidentified directions, in units of its prior range: a parameter
@@ -391,7 +433,7 @@ class Verdict(NamedTuple):
     sound: bool
 
 
-def verdict(fit: "Fit", facts: Assessment | None = None) -> Verdict:
+def verdict(fit: Fit, facts: Assessment | None = None) -> Verdict:
     """How well the model describes the data, what the errors mean, and what the data identify."""
     facts = facts or assess(fit)
     said = statements(facts)
@@ -407,14 +449,14 @@ def verdict(fit: "Fit", facts: Assessment | None = None) -> Verdict:
     return Verdict([one.sentence for one in said["verdict"]], remarks, sound)
 
 
-def summary(fit: "Fit") -> list[str]:
+def summary(fit: Fit) -> list[str]:
     """A few lines for the terminal: the verdict, chi-square, and how the fit ended."""
     opening = verdict(fit)
     good = f"chi2/dof {fit.reduced_chi_square:.4g} ({fit.chi_square:.6g} / {fit.degrees_of_freedom})"
     return [*opening.sentences, *opening.remarks, f"{good}; {fit.status}"]
 
 
-def sampled(posterior: "Posterior") -> list[str]:
+def sampled(posterior: Posterior) -> list[str]:
     """How long the chain is, whether that is long enough for its estimates, and which modes it has."""
     steps, walkers = posterior.chain.shape[:2]
     longest, worst = float(np.max(posterior.autocorrelation_time)), float(np.max(posterior.r_hat))
@@ -442,7 +484,7 @@ def sampled(posterior: "Posterior") -> list[str]:
     return words
 
 
-def reportable(posterior: "Posterior") -> bool:
+def reportable(posterior: Posterior) -> bool:
     """Whether estimates may be had from the chain."""
     return posterior.converged or posterior.allow_unconverged
 

@@ -167,8 +167,8 @@ def draw_points(
     sigma: np.ndarray | None = None,
 ) -> None:
     """Values of `rows` against the signed angle, with error bars from `sigma` (N, C); grey where they are not used."""
-    signed, style = signed_angle(data), {"fmt": "o", "markersize": 2.5 if len(rows) > 60 else 3.5}
-    style |= {"markeredgewidth": 0.0, "elinewidth": 0.6, "zorder": 2}
+    style: dict[str, Any] = {"fmt": "o", "markersize": 2.5 if len(rows) > 60 else 3.5, "markeredgewidth": 0.0}
+    style, signed = style | {"elinewidth": 0.6, "zorder": 2}, signed_angle(data)
     used, others = rows[data.mask[rows]], rows[~data.mask[rows]]
     if used.size:
         errors, pale = None if sigma is None else sigma[used, channel], mpl.colors.to_rgba(colour, 0.35)

@@ -1,6 +1,6 @@
 """Pictures of a fit, and of predictions, beside data, and of its parameters."""
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import matplotlib as mpl
 import numpy as np
@@ -9,8 +9,10 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
 from fits.data.geometry import Floats, direction
+from fits.data.measurements import Measurements
 from fits.data.scans import Incidence, in_plane, signed_angle
-from fits.prediction.predict import with_discrepancy
+from fits.optimise.result import Fit
+from fits.prediction.predict import Prediction, with_discrepancy
 from fits.problem.model import Model
 from fits.reports.plots.data import (
     ANGLE_LABEL,
@@ -27,12 +29,7 @@ from fits.reports.plots.data import (
     value_norm,
 )
 from fits.reports.verdicts import over_all_rows, residual_unit
-
-if TYPE_CHECKING:
-    from fits.data.measurements import Measurements
-    from fits.optimise.result import Fit
-    from fits.prediction.predict import Prediction
-    from fits.sampling.posterior import Posterior
+from fits.sampling.posterior import Posterior
 
 INTERVAL_DRAWS = 200  # posterior draws behind an interval
 STEEPEST = 89.9  # degrees: in the tangent plane every BRDF of a stack is 0
@@ -40,13 +37,13 @@ STEP = 1.0  # degrees between the points of a model curve
 FEWEST_IN_PLANE = 3  # measurements that make a panel
 
 
-def bsdf(fit: "Fit") -> np.ndarray:
+def bsdf(fit: Fit) -> np.ndarray:
     """Predicted BSDF at every row, with the model discrepancy, (N, C), in 1/sr; NaN in unused rows."""
     used = fit.problem.data.used()
     return over_all_rows(fit, with_discrepancy(fit, used.wi, used.wo, fit.predicted))
 
 
-def misfit(fit: "Fit") -> np.ndarray:
+def misfit(fit: Fit) -> np.ndarray:
     """Measurements less `bsdf`, in units of the noise, (N, C); NaN in rows that were not used.
 
     With a model discrepancy these are smaller than the noise, since it follows the data: `standardised` are not.
@@ -65,7 +62,7 @@ class Curve(NamedTuple):
     interval: Floats | None
 
 
-def curves_picture(fits: "dict[str, Fit]", posterior: "Posterior | None" = None) -> Figure | None:
+def curves_picture(fits: dict[str, Fit], posterior: Posterior | None = None) -> Figure | None:
     """Data and models along each incidence, with standardised residuals below.
 
     With a model discrepancy there are two curves, with and without it; residuals are of the first.
@@ -85,7 +82,7 @@ def curves_picture(fits: "dict[str, Fit]", posterior: "Posterior | None" = None)
     return _panels(first.problem.data, shown, curves, list(map(misfit, fits.values())), sigma)
 
 
-def prediction_picture(prediction: "Prediction", data: "Measurements") -> Figure | None:
+def prediction_picture(prediction: Prediction, data: Measurements) -> Figure | None:
     """Held-out data and the median and interval of their prediction, which is of the used data, along each incidence.
 
     None where no incidence has at least three measurements in the plane of incidence.
@@ -99,7 +96,7 @@ def prediction_picture(prediction: "Prediction", data: "Measurements") -> Figure
 
 
 def _panels(
-    data: "Measurements",
+    data: Measurements,
     shown: list[Incidence],
     curves: dict[str, list[Curve]],
     residuals: list[Floats],
@@ -157,14 +154,14 @@ def _line(axes: Axes, curve: Curve, channel: int, colour: str, name: str, place:
         axes.fill_between(angle, *ends[:, :, channel], label="95 % interval" if name else "", **style)
 
 
-def _in_plane(data: "Measurements") -> list[Incidence]:
+def _in_plane(data: Measurements) -> list[Incidence]:
     """Incidences that have a panel, with their rows in the plane of incidence."""
     flat = in_plane(data)
     enough = [one for one in chosen(data) if np.count_nonzero((flat & data.mask)[one.rows]) >= FEWEST_IN_PLANE]
     return [Incidence(one.theta, one.phi, one.rows[flat[one.rows]]) for one in enough]
 
 
-def _curves(fit: "Fit", shown: list[Incidence], posterior: "Posterior | None") -> list[Curve]:
+def _curves(fit: Fit, shown: list[Incidence], posterior: Posterior | None) -> list[Curve]:
     """The model along each incidence, all of them predicted at once; its interval is without discrepancy."""
     signed, angles = signed_angle(fit.problem.data), []
     for incidence in shown:
@@ -191,7 +188,7 @@ def _curves(fit: "Fit", shown: list[Incidence], posterior: "Posterior | None") -
     return list(map(Curve, angles, parts(best), parts(latent), parts(ends, 1)))
 
 
-def maps_picture(fit: "Fit") -> Figure | None:
+def maps_picture(fit: Fit) -> Figure | None:
     """Data, model and residual over the viewer's hemisphere, a row per incidence, of the first channel; None for data
     that stays in plane."""
     data = fit.problem.data
@@ -217,7 +214,7 @@ def maps_picture(fit: "Fit") -> Figure | None:
     return figure
 
 
-def corner_picture(posterior: "Posterior") -> Figure:
+def corner_picture(posterior: Posterior) -> Figure:
     """Every pair of parameters and every single parameter, over the posterior's samples; lines at the fitted values."""
     import corner
 
