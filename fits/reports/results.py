@@ -191,8 +191,8 @@ def save_posterior(posterior: Posterior, directory: str | Path) -> None:
     Raises:
         ValueError: the chain is too short to report from.
     """
-    names = ["converged", "allow_unconverged", "burn_in", "acceptance", "status", "divergences"]
-    names += ["autocorrelation_time", "effective_samples", "r_hat"]
+    names = ["converged", "allow_unconverged", "burn_in", "acceptance", "status", "divergences", "autocorrelation_time"]
+    names += ["effective_samples", "r_hat"]
     content = {
         "layerjax_result": SCHEMA,
         "versions": versions(),

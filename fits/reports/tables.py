@@ -11,7 +11,7 @@ import numpy as np
 from fits.data.geometry import azimuth, polar
 from fits.data.measurements import Measurements
 from fits.data.scans import incidences
-from fits.optimise.result import Fit, numerical_error_in_words
+from fits.optimise.result import Fit
 from fits.prediction.compare import Comparison
 from fits.prediction.predict import LEVELS, Prediction, scores
 from fits.problem.problem import Problem
@@ -92,15 +92,12 @@ def problem_rows(fit: Fit) -> tuple[tuple[str, str], ...]:
     problem = fit.problem
     fixed = problem.scale is None or isinstance(problem.scale, int | float)
     transport = problem.transport if isinstance(problem.transport, str) else type(problem.transport).__name__
-    rows = [
+    return (
         ("noise", noise_in_words(problem)),
         ("objective", problem.objective),
         ("scale", f"fixed at {problem.scale or 1:g}" if fixed else "fitted, see the table of values"),
         ("transport", transport if fit.resolution is None else f"{transport}, {fit.resolution}"),
-    ]
-    if fit.resolution:
-        rows.append(("numerical error of the model", numerical_error_in_words(fit.numerical_error)))
-    return tuple(rows)
+    )
 
 
 def parameter_table(fit: Fit, both: bool = False) -> Table:

@@ -94,9 +94,9 @@ def instrument_limits(fit: Fit) -> dict[str, float]:
     A mirror lobe is as wide as its full width at half maximum, in the angle of the viewer. That has to be wider than
     the aperture of the `Instrument`, and hold two steps of the scan that is finest about the mirror direction.
     """
-    instrument, material, found = fit.problem.instrument, fit.problem.stack, {}
+    instrument, material = fit.problem.instrument, fit.problem.stack
     aperture = 0.0 if instrument is None else math.hypot(instrument.source_aperture, instrument.detector_aperture)
-    resolved = max(aperture, STEPS * finest_step(fit.problem.data.used()))
+    resolved, found = max(aperture, STEPS * finest_step(fit.problem.data.used())), dict[str, float]()
     for prefix, stack in stacks_by_name(material).items() if isinstance(material, lj.Stack | lj.Mixture) else ():
         parts = {f"{prefix}layers[{place}].alpha": layer for place, layer in enumerate(stack.layers)}
         for name, part in (parts | {f"{prefix}base.alpha": stack.base}).items():
@@ -130,25 +130,20 @@ def finest_step(data: Measurements) -> float:
 class Assessment:
     """The facts of a fit that decide what is said of it; residuals are whitened where there is a model discrepancy."""
 
+    fit: Fit
     options: ReportOptions
     count: int  # of residuals
     lag_one: float  # correlation of neighbours in angle; NaN without any
     pairs: int  # of neighbours
     ratio: float  # chi-square per degree of freedom
-    freedom: int  # degrees of freedom
     excess: float  # chi-square above its expectation, in its own standard deviations
-    converged: bool
-    likelihood: bool  # whether the objective is one
     noise_assumed: bool
     described: bool  # whether the stack without discrepancy is as near to the data as noise and options allow
     misfit: tuple[float, float] | None  # factors within which half and 95 % of the positive data are of that stack
     noise: float  # median of the stated noise as a share of the value; NaN if none is above zero
     discrepancy: tuple[Any, float] | None  # its parameters, and the reduced chi-square without it
-    unidentified: tuple[Direction, ...]
     words: Mapping[str, str]  # of each parameter, see `identifiability`
-    alternatives: int  # other minima that fit equally well
-    numerical_error: float | None  # of the model, in standard deviations of the data
-    resolved: bool  # whether that is small enough
+    resolved: bool  # whether the numerical error is small enough
 
     @property
     def size(self) -> str:
@@ -214,24 +209,19 @@ def assess(fit: Fit, options: ReportOptions = DEFAULT) -> Assessment:
     limit = float(fit.settings.get("numerical_error", FitOptions().numerical_error))
     pairs = neighbours(fit.problem.data, standardised(fit))
     return Assessment(
+        fit=fit,
         options=options,
         count=used.values.size,
         lag_one=correlation(*pairs),
         pairs=pairs[0].size,
         ratio=fit.reduced_chi_square,
-        freedom=fit.degrees_of_freedom,
         excess=(fit.reduced_chi_square - 1.0) / spread,
-        converged=fit.converged,
-        likelihood=likelihood,
         noise_assumed=likelihood and fit.problem.noise_is_assumed,
         described=described,
         misfit=misfit,
         noise=noise,
         discrepancy=discrepancy,
-        unidentified=fit.unidentified,
         words=identifiability(fit, options),
-        alternatives=len(fit.alternatives),
-        numerical_error=fit.numerical_error,
         resolved=fit.numerical_error is None or fit.numerical_error <= limit,
     )
 
@@ -299,7 +289,7 @@ def _description(f: Assessment) -> Statement:
         half, most = map(_deviation, f.misfit)
         which = "stack without model discrepancy" if f.discrepancy else "model"
         near = f"Half of the {f.count:,} measurements are within {half} of the {which}, 95 % within {most}"
-    if not f.likelihood:
+    if not f.fit.is_posterior:
         return Statement(f"{near}; the objective is a named residual, which has no noise model to judge this by.")
     if not f.described:
         misfit = "" if f.misfit is None else f": median misfit {half}, stated noise {100.0 * f.noise:.2g} %"
@@ -322,10 +312,10 @@ def _deviation(factor: float) -> str:
 
 def _errors(f: Assessment) -> Statement:
     """What the standard errors mean."""
-    if not f.converged:
+    if not f.fit.converged:
         words = "The fit did not converge: values are the best found, not a minimum, and have no valid errors."
         return Statement(words, {"errors": "invalid"})
-    if not f.likelihood:
+    if not f.fit.is_posterior:
         words = "The errors are scaled by the remaining scatter and are only indicative."
         return Statement(words, {"errors": "indicative"})
     if not f.described:
@@ -333,10 +323,10 @@ def _errors(f: Assessment) -> Statement:
         if f.discrepancy:
             words = "The standard errors include the model discrepancy, and hold only if it accounts for the misfit."
         return Statement(words, {"errors": "conditional", "description": "no"})
-    if f.alternatives:
+    if count := len(f.fit.alternatives):
         others = "Another local minimum of the same model fits"
-        if f.alternatives > 1:
-            others = f"{f.alternatives} other local minima of the same model fit"
+        if count > 1:
+            others = f"{count} other local minima of the same model fit"
         words = f"{others} equally well: the standard errors are those of the best one only, sampling covers all."
         return Statement(words, {"errors": "one minimum"})
     size, correlation = f.error_factors
@@ -366,7 +356,7 @@ def _parameters(f: Assessment) -> Statement:
     def weak(direction: Direction) -> list[str]:
         return [name for name in direction.weights if direction.error_of(name) > UNIDENTIFIED_BEYOND]
 
-    directions, parts = [one for one in f.unidentified if set(weak(one)) & set(words)], []
+    directions, parts = [one for one in f.fit.unidentified if set(weak(one)) & set(words)], []
     if directions:
         names, more = weak(directions[0]), " (and more)" if directions[1:] else ""
         kind = "unidentified" if directions[0].unconstrained else "weakly identified"
@@ -396,7 +386,7 @@ def _remarks(f: Assessment) -> list[Statement]:
         words = f"Model discrepancy: {amplitude:.2g} % of the BSDF{grazing}; {words}. The reduced chi-square is"
         remarks.append(Statement(f"{words} {f.ratio:.3g} with it and {without:.3g} without."))
     if not f.resolved:
-        error = numerical_error_in_words(f.numerical_error)
+        error = numerical_error_in_words(f.fit.numerical_error)
         remarks.append(Statement(f"The numerical error of the model is {error}: a finer resolution may change values."))
     if f.noise_assumed:
         remarks.append(Statement(NOISE_ASSUMED))
@@ -406,10 +396,10 @@ def _remarks(f: Assessment) -> list[Statement]:
 def _residuals(f: Assessment) -> list[Statement]:
     """Whether the residuals are what the noise model predicts; with a discrepancy, all is about the whitened ones."""
     residuals = [Statement("Residuals are in units of their own scatter: a named residual has no noise model.")]
-    if f.likelihood:
-        spread = math.sqrt(2.0 / max(f.freedom, 1))
-        words = f"The reduced chi-square of the {f.which} is {f.ratio:.3g} with {f.freedom} degrees of freedom, for"
-        words, claims = f"{words} which {f.expectation} predicts 1 ± {spread:.2g}", {"size": f.size}
+    if f.fit.is_posterior:
+        freedom, claims = f.fit.degrees_of_freedom, {"size": f.size}
+        words = f"The reduced chi-square of the {f.which} is {f.ratio:.3g} with {freedom} degrees of freedom, for"
+        words = f"{words} which {f.expectation} predicts 1 ± {math.sqrt(2.0 / max(freedom, 1)):.2g}"
         if f.size == "small" and not f.correlated:
             words, claims = f"{words}: sigma is too large, or holds a common error", claims | {"noise": "too large"}
         claims |= {} if f.size == "expected" else {"residuals": "misfit"}
