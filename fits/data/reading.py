@@ -45,14 +45,11 @@ class ReadOptions(FileOptions):
             Radiance), "fred", "astm" (E1392), "pab", "alta", "speos" or "ssdd"; None finds out from the content.
         quantity: what the numbers in the file are: "brdf", f in 1/sr; "brdf_cos", f |cos theta_o|; or
             "reflectance_factor", pi f. A CSV says so in its column names, and then this picks among them; Zemax,
-            LightTools, FRED and ASTM files hold "brdf" unless this says otherwise; ALTA files that do not say what they
-            hold need it; all others say it themselves.
-        geometry: for MERL and RGL only, the directions to look up; None: of MERL the default `slices`, of RGL the
-            directions at which the file has values.
+            LightTools, FRED and ASTM files hold "brdf" unless this says otherwise; ALTA files may need it.
+        geometry: for MERL and RGL only, the directions to look up; None: the default `slices`, or those of RGL's file.
         lookup: for MERL only, "centre" or "linear": see `fits.data.formats.merl.read`.
         bins: for MERL and RGL only: so many bins, or nodes, from all over the table, at most 100,000, or "all".
-        strata: for MERL only, what each of these bins stands for an equal share of: "bins" of the table, or "flux",
-            the projected solid angle of light and viewer.
+        strata: for MERL only, what bins are equal shares of: "bins" of the table, or "flux", projected solid angles.
         seed: of their choice.
         wavelengths, corrected: for iad's files only: see `read_slab`.
         min_retro_angle: mask measurements closer than so many degrees to retro-reflection.
@@ -110,9 +107,9 @@ class ReadOptions(FileOptions):
                     raise ValueError(f"{path}: holds totals, {words}")
             return data, None
         data = self._masked(data)
-        kept = [select(data, words) for words in self.select if not words.startswith(CHANNELS)]
-        keep = np.all(kept, axis=0) if kept else np.ones(len(data), bool)
-        held = np.any([select(data, words) for words in self.hold_out], axis=0) if self.hold_out else ~keep & False
+        keep, held = np.ones(len(data), bool), np.zeros(len(data), bool)
+        keep = np.all([keep, *(select(data, words) for words in self.select if not words.startswith(CHANNELS))], axis=0)
+        held = np.any([held, *(select(data, words) for words in self.hold_out)], axis=0)
         fitted = data.where(keep & ~held)
         if data.mask.any() and not fitted.mask.any():
             raise ValueError(f"{path}: --select and --hold-out leave nothing to fit")

@@ -36,8 +36,7 @@ class Incidence:
 def incidences(data: Pairs) -> list[Incidence]:
     """The distinct incident directions, by polar angle then azimuth.
 
-    Directions within `SAME_ANGLE` count as the same, as an instrument does not return to an angle to the last digit;
-    near the normal all azimuths are therefore one.
+    Directions within `SAME_ANGLE` count as the same, as no instrument repeats an angle to the last digit.
     """
     theta = data.theta_i
     phi = np.where(theta < AT_NORMAL, LIGHT_AZIMUTH, data.phi_i)

@@ -25,8 +25,7 @@ class Totals(Measurements):
         wo: (N, 3), specular or undeviated direction, in the hemisphere that the light is measured in.
         values, sigma: (N, C), shares of the incident light, in [0, 1].
         kinds: N names, of `KINDS`.
-        spheres: integrating spheres of the measurement, which the model then includes; None for values of the sample
-            itself.
+        spheres: integrating spheres, which the model then includes; None for values of the sample itself.
     """
 
     kinds: tuple[Kind, ...] = ()

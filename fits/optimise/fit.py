@@ -71,8 +71,7 @@ def fit(
         stack: holds `Free` where a number is to be fitted; or a `Problem` or `Joint`, in which all else is said.
         data: only the samples that its mask leaves in are used.
         transport: see `Problem`. A resolution that is not given is chosen: coarse for the starts, at the end so fine
-            that the numerical error of the model stays below a tenth of the data's standard deviation, where that is
-            within reach. `Fit.problem` has it.
+            that the model's numerical error is below a tenth of the data's sigma, where that is within reach.
         noise, scale, objective, instrument: see `Problem`.
         starts: at least 1: the `Free.start` values, then scrambled Sobol points of the box (in the logarithm for
             parameters with a `LogNormal` or `LogUniform` prior), drawn with `seed`. The lowest end of all is the fit;
@@ -80,8 +79,7 @@ def fit(
         options: tolerances and thresholds.
         progress: called with ("fit", starts done, starts, note).
         checkpoint: a file that each start is kept in as it ends: a fit that was killed takes those that are there for
-            done. It stays, as does one beside it for a second fit with model discrepancy; one of another problem is
-            replaced.
+            done. It stays, as does one beside it for a second fit; one of another problem is replaced.
         screen: stay at the resolution of the starts, do not estimate its error, continue only the starts that are
             lowest after a few steps, and stop near the minimum: enough to rank stacks.
 

@@ -101,8 +101,7 @@ class Resolutions:
 def resolutions(problem: Problem) -> Resolutions | None:
     """Resolutions that the problem's transport may take; None if it has none.
 
-    Which transport "auto" is, is decided by what is known while tracing: a fit that passes through an index of 1 or an
-    albedo of 0 stays with one.
+    Which transport "auto" is, is decided while tracing: a fit that passes an index of 1 or albedo 0 stays with one.
     """
     transport, model = problem.transport, problem.model
     directions = model.known if model.optics is None else model.optics.known
@@ -175,8 +174,7 @@ def leaves_rays_open(problem: Problem) -> bool:
 
 
 def with_rings(problem: Problem, vector: Floats, most: int | None = None) -> Problem:
-    """The problem with as many rings of rays a cone as its lobes ask for at this vector (P,), up to so many; no fewer
-    than it has."""
+    """The problem with as many rings of rays a cone as its lobes ask for at this vector (P,), and no fewer."""
     instrument, parts, data = cast(Instrument, problem.instrument), problem.build(vector), problem.data.used()
     tilt = 0.0 if parts.instrument.tilt is None else abs(float(parts.instrument.tilt))
     widths = instrument.source_aperture, instrument.detector_aperture
@@ -220,8 +218,7 @@ def for_starts(problem: FittingProblem) -> tuple[FittingProblem, dict[str, Choic
 def refined(
     at: Optimum, choices: Mapping[str, Choice], options: FitOptions, progress: Progress
 ) -> tuple[Optimum, Accuracy | None]:
-    """The optimum at the resolution that the noise of each data set asks for, or at the given one; None: there is no
-    resolution."""
+    """The optimum at the resolution that the noise of each data set asks for, and how accurate it is there."""
     while True:
         changed, accuracies = {}, {}
         for name, predicted in at.problem.shares(at.predicted).items():

@@ -89,8 +89,7 @@ def compare(
         progress: called with (name and stage, done, total, note) meanwhile.
 
     Raises:
-        ValueError: fewer than two candidates, different data, different objectives, or joint fits; a part of one may be
-            compared, but not with `refit`.
+        ValueError: fewer than two candidates, different data or objectives, joint fits, or parts of one with `refit`.
     """
     fits = fits_of(candidates)
     require_kind("options", options, ComparisonOptions, None)

@@ -1,8 +1,7 @@
 """Cross-validation, and which of several stacks predicts held-out data best: elpd differences, stacking weights.
 
 A fit is repeated without one group of measurements after the other, and predicts them. A single measurement would be
-predicted well by its neighbours, whatever the stack. Groups are therefore whole incidences; of fewer than three, parts
-of every scan.
+predicted well by its neighbours, whatever the stack. Groups are whole incidences; of fewer than three, parts of scans.
 """
 
 import math
@@ -40,8 +39,7 @@ class CrossValidation:
 
     groups: names of what was held out together. rows: of each group among the used samples. log_density: log predictive
     density of each measurement, (N, C), by the fit without its group; 0 for those in no group, whose plane has too few
-    to hold some out. converged: whether all of these fits did. errors: standard error of the elpd of each group, (G,),
-    by the number of draws of the posterior.
+    to hold some out. converged: whether all fits did. errors: of each group's elpd, (G,), by the number of draws.
     """
 
     groups: tuple[str, ...]

@@ -4,8 +4,7 @@ Proposals are Laplace's approximations about the minima of the fit, and where th
 ridges. The Pareto k of the largest weights says how well the draws represent the posterior (Vehtari, Simpson, Gelman,
 Yao & Gabry 2024, JMLR 25, 72). While weights are too uneven, a mixture is fitted to the weighted draws, and drawn from
 as well (Cappe, Guillin, Marin & Robert 2004, J. Comput. Graph. Stat. 13, 907); the draws of all proposals are weighted
-as those of their mixture (Cornuet, Marin, Mira & Robert 2012, Scand. J. Stat. 39, 798). Their mean weight is the
-evidence, for any proposal.
+as those of their mixture (Cornuet, Marin, Mira & Robert 2012, Scand. J. Stat. 39, 798). Their mean is the evidence.
 """
 
 from dataclasses import dataclass

@@ -9,7 +9,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
@@ -35,6 +35,9 @@ from fits.sampling.posterior import Posterior
 from fits.sampling.proposals import Density
 from layerjax._checks import in_short, require_count, require_kind, require_number, require_seed
 from layerjax.compiling import programs_kept
+
+if TYPE_CHECKING:
+    from fits.prediction.compare import Average
 
 # quantiles of a `Summary`: the ends of the central 50 % and 95 % intervals, and the median
 LEVELS = (0.025, 0.25, 0.5, 0.75, 0.975)
@@ -63,14 +66,12 @@ class Prediction:
         wi, wo: directions, (M, 3).
         channels: C names.
         values: the stack's own value for each of D draws of the posterior, (D, M, C), in 1/sr.
-        means, scales: location and scale of a measurement for each draw, (D, M, C), in 1/sr; with a discrepancy, of its
-            `logarithm`.
+        means, scales: of a measurement for each draw, (D, M, C), in 1/sr; with a discrepancy, of its `logarithm`.
         softness: of that logarithm, (M, C) or (D, M, C), in 1/sr; None where values themselves are meant.
         discrepancy_sd: standard deviation of the discrepancy about `means`, (D, M, C), of the logarithm; None without.
         degrees_of_freedom: of Student's t; infinite for a Gaussian.
         seed: of the draws that `bsdf` and `predictive` summarise.
-        pareto_k: Pareto k of the importance weights that the draws of a fit's posterior are resampled by (see
-            `fits.evidence`); NaN for draws of a chain.
+        pareto_k: of the importance weights that draws are resampled by (see `fits.evidence`); NaN for a chain.
         effective_draws: effective sample size of the D draws of the posterior.
         measurements: the measurements that were predicted; None for a `Geometry`.
     """
@@ -237,23 +238,16 @@ def scores(prediction: Prediction, measurements: Measurements, rows: NDArray[np.
     )
 
 
-class Predictor(Protocol):
-    """Several fits that predict as one: see `fits.average`."""
-
-    def predict(self, at: Geometry | Measurements, *, draws: int, seed: int) -> Prediction: ...
-
-
 @programs_kept()
 def predict(
-    fitted: Fit | Posterior | Predictor, at: Geometry | Measurements, *, draws: int = DRAWS, seed: int = 0
+    fitted: "Fit | Posterior | Average", at: Geometry | Measurements, *, draws: int = DRAWS, seed: int = 0
 ) -> Prediction:
     """Predict the BSDF along other directions, and new measurements of it.
 
     Args:
         fitted: a posterior; or a fit, whose posterior is sampled by importance (see `fits.evidence`), of a part of a
             joint fit by its normal approximation; or an average.
-        at: pairs of directions in the upper hemisphere, or the lower one of a stack without a base; of `Measurements`
-            their used samples, with their own sigma.
+        at: pairs of directions, above a stack with a base; of `Measurements` the used samples, with their own sigma.
         draws: draws of the posterior, at least 2.
         seed: random seed of draws and noise.
 

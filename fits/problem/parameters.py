@@ -231,8 +231,7 @@ class PowerLaw(Shown):
     """A number a channel, ``amplitude (wavelength / reference)^-exponent``: in the place of one in a stack.
 
     amplitude: the number at the reference, in its unit, or `Free` with low >= 0. exponent: unitless, or `Free`; of
-    reduced scattering 0.5 to 4 are common. wavelengths: one a channel, in nm. reference: in nm; the geometric mean of
-    the wavelengths by default.
+    reduced scattering 0.5 to 4 are common. wavelengths: one a channel, in nm. reference: in nm; None: geometric mean.
 
     Raises:
         ValueError: nothing is free, a number a channel, fewer than two wavelengths, or one that is not above 0.

@@ -12,8 +12,7 @@
     albedo = [0.1, 0.2, 0.3]                   # one number, or one a channel
 
 ``docs/guides/own_data.md`` says what else may stand there. Keys are the parameters of the classes of the same name; the
-`kind` of an SGGX is called `shape` here. Bad input is a ValueError on one line that names the place (``layers[0]``) and
-the parameter.
+`kind` of an SGGX is called `shape` here. Bad input is a ValueError on one line that names place and parameter.
 """
 
 import difflib

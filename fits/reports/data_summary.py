@@ -1,5 +1,4 @@
-"""What is in a measurement file, before any model: tables of its content, and sentences on doubtful angles,
-reciprocity, energy and repeated measurements."""
+"""What is in a measurement file: tables, and sentences on doubtful angles, reciprocity, energy and repeats."""
 
 import math
 from typing import NamedTuple
@@ -187,8 +186,7 @@ def repeats(data: Measurements) -> Agreement | None:
 
 
 def energies(data: Measurements) -> list[Energy]:
-    """Energy of each incidence whose measurements cover at least half of the projected hemisphere; measurements on one
-    side of the plane of incidence are mirrored."""
+    """Energy of each incidence that is measured over half of the projected hemisphere; of one side, mirrored."""
     used, result = _above(data), []
     for one in incidences(used):
         azimuth = np.radians(relative_azimuth(used)[one.rows])

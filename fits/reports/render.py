@@ -50,8 +50,7 @@ def render(
         size: pixels of a sphere's diameter, in [16, 1024].
 
     Raises:
-        ValueError: the size is out of range, the stack ends in another index than that of air, or the transport is
-            random or does not carry the stack.
+        ValueError: a size out of range, a stack that ends in another index than air, or a transport that is random.
     """
     require_material(stack)
     if not (isinstance(size, int) and 16 <= size <= 1024):  # more take several GB, and the picture has no more across

@@ -2,8 +2,7 @@
 
 `assess` collects the facts of a fit, and `statements` depend on these alone. Each says what it claims of the errors,
 the residuals, the noise or the parameters, so that a test can go through all combinations of facts and find that no two
-statements of a report contradict each other. With a model discrepancy, statements on residuals are about those whitened
-by the fitted covariance.
+statements of a report contradict each other. With a model discrepancy, residuals are those whitened by the covariance.
 """
 
 import math

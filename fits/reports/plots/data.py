@@ -178,34 +178,28 @@ def draw_points(
         axes.errorbar(signed[others], data.values[others, channel], color=GREY, **style)
 
 
-def is_logarithmic(values: np.ndarray) -> bool:
-    """Whether the positive ones among `values` span more than a factor `LOG_ABOVE`."""
+def value_norm(values: np.ndarray) -> Normalize:
+    """A logarithmic scale where the positive values span more than `LOG_ABOVE`, else one that includes zero."""
     positive = values[values > 0.0]
-    return bool(positive.size and positive.max() > LOG_ABOVE * positive.min())
+    if positive.size and positive.max() > LOG_ABOVE * positive.min():
+        return LogNorm(positive.min(), positive.max())
+    return Normalize(float(np.min(values, initial=0)), float(np.max(values)) if values.size else 0.0)
 
 
 def value_axis(axes: Axes, values: np.ndarray, label: str) -> None:
-    """A logarithmic axis when the positive values span more than `LOG_ABOVE`, one that starts at zero otherwise."""
-    if is_logarithmic(values):
+    """An axis of values by the scale of `value_norm`, and angles on the other."""
+    norm = value_norm(values)
+    low, high = norm.vmin or 0.0, norm.vmax or 0.0
+    if isinstance(norm, LogNorm):
         axes.set_yscale("log")
-        positive = values[values > 0.0]
-        low, high = positive.min() / 1.6, positive.max() * 1.6
-        axes.set_ylim(low, high)
+        axes.set_ylim(low / 1.6, 1.6 * high)
         axes.yaxis.set_major_locator(mpl.ticker.LogLocator(subs=(1.0,) if high > 1e3 * low else (1.0, 2.0, 5.0)))
         axes.yaxis.set_major_formatter(mpl.ticker.StrMethodFormatter("{x:g}"))
         axes.yaxis.set_minor_formatter(mpl.ticker.NullFormatter())
-    elif values.size and values.min() >= 0.0 and values.max() > 0.0:
-        axes.set_ylim(0.0, 1.1 * values.max())
+    elif low == 0.0 < high:
+        axes.set_ylim(0.0, 1.1 * high)
     axes.set_ylabel(label)
     axes.xaxis.set_major_locator(mpl.ticker.MultipleLocator(30.0))
-
-
-def value_norm(values: np.ndarray) -> Normalize:
-    """The colour scale for a map of `values`, by the rule of `value_axis`."""
-    if is_logarithmic(values):
-        positive = values[values > 0.0]
-        return LogNorm(positive.min(), positive.max())
-    return Normalize(min(0.0, float(values.min())), float(values.max()))
 
 
 def hemisphere_map(

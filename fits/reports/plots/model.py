@@ -189,8 +189,7 @@ def _curves(fit: Fit, shown: list[Incidence], posterior: Posterior | None) -> li
 
 
 def maps_picture(fit: Fit) -> Figure | None:
-    """Data, model and residual over the viewer's hemisphere, a row per incidence, of the first channel; None for data
-    that stays in plane."""
+    """Data, model and residual of the first channel over the viewer's hemisphere; None for data that stays in plane."""
     data = fit.problem.data
     if not (shown := mapped(data)):
         return None
