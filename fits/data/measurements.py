@@ -56,8 +56,7 @@ class Measurements(Pairs):
         source: where the samples came from.
 
     Raises:
-        ValueError: shapes do not fit together, a number is not finite or too large, a direction is no unit vector, or
-            sigma is negative, or next to zero in a sample that is used.
+        ValueError: shapes do not fit together, or values, directions or sigma are out of range.
     """
 
     wi: Floats

@@ -74,8 +74,7 @@ def fit(
             that the model's numerical error is below a tenth of the data's sigma, where that is within reach.
         noise, scale, objective, instrument: see `Problem`.
         starts: at least 1: the `Free.start` values, then scrambled Sobol points of the box (in the logarithm for
-            parameters with a `LogNormal` or `LogUniform` prior), drawn with `seed`. The lowest end of all is the fit;
-            where a parameter ends on a bound, L-BFGS-B checks it.
+            parameters with a `LogNormal` or `LogUniform` prior), drawn with `seed`. The lowest end of all is the fit.
         options: tolerances and thresholds.
         progress: called with ("fit", starts done, starts, note).
         checkpoint: a file that each start is kept in as it ends: a fit that was killed takes those that are there for

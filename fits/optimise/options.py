@@ -16,9 +16,8 @@ class FitOptions:
             its box plus this many standard errors (each counted up to a twentieth of the box).
         same_cost: and if their costs agree within this, in the log-posterior, times the reduced chi-square above 1.
         equivalent_cost: below this difference in log-posterior, times the same, minima explain the data equally well.
-        autocorrelation, autocorrelation_errors: a fit with independent noise is fitted again with model discrepancy if
-            residuals of neighbours along the scans are correlated by more than the first, and by more than so many
-            standard errors of that (see `Noise.discrepancy`).
+        autocorrelation, autocorrelation_errors: model discrepancy is added where residuals of neighbours correlate by
+            more than the first, and by more than so many standard errors of that (see `Noise.discrepancy`).
         numerical_error: of the model, in sigma of the data, that a chosen resolution stays below, if that can be.
     """
 

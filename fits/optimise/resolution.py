@@ -3,8 +3,7 @@
 A resolution that is left open is that of the start values where starts run, but no finer than is useful far away from
 the data. At the optimum it is compared with finer ones, by values alone, until they agree to a tenth of the noise: only
 then are the minima that may be the best, or as good as it, fitted again, as programs of a finer resolution take seconds
-to compile. A resolution that is given is compared with a finer one, and stays. The rays that stand for the cones of an
-instrument are those that the lobe asks for that was found.
+to compile. A resolution that is given is compared with a finer one, and stays. The rays of cones follow from the lobe.
 """
 
 import warnings
@@ -77,13 +76,6 @@ class Resolutions:
             return None
         return None if finer == transport else finer
 
-    def partly_finer(self, transport: lj.AddingDoubling, finer: lj.AddingDoubling) -> list[lj.AddingDoubling]:
-        """Transports between the two: as fine as `finer` in modes alone, which cost less, and in nodes alone."""
-        if self.tilted:
-            return []
-        parts = [replace(transport, modes=finer.modes), replace(transport, nodes=finer.nodes)]
-        return [part for part in parts if part not in (transport, finer)]
-
     def in_words(self, transport: lj.AddingDoubling) -> str:
         """Such as "12 nodes, 16 modes"."""
         if self.tilted:
@@ -131,8 +123,7 @@ def error_between(
 ) -> Callable[[lj.AddingDoubling, lj.AddingDoubling], float]:
     """Largest difference between two resolutions, in standard deviations of the data; NaN if one is not finite.
 
-    predicted: by the problem with the vector (P,) at the resolution of `transport`. Each other is computed once, and
-    values count in the measure of a named objective if it is one.
+    predicted: with the vector (P,) at the resolution of `transport`. Values count in the measure of a named objective.
     """
     values, sd = {transport: predicted}, spread(problem, vector, predicted)
 
@@ -148,8 +139,7 @@ def error_between(
 
 
 def spread(problem: Problem, vector: Floats, predicted: Floats) -> Floats:
-    """Standard deviations of the data, (N, C), with noise levels as they are in `vector` (P,), and model discrepancy;
-    for a named objective the scatter of its residuals, one number."""
+    """Standard deviations of the data, (N, C), with model discrepancy; of a named objective its scatter, a number."""
     if problem.objective == "likelihood":
         sigma = np.asarray(problem.call(Model.sigma_at, vector, predicted), float)
         correlation = problem.build(vector).correlation
@@ -250,7 +240,9 @@ def _judged(
         note, finer = "" if known.open else ", as given", known.finer(own)
         error = error_of(known.as_stated(own.coarser()), own) if finer is None else error_of(own, finer)
         while finer is not None and known.open and error > allowed:
-            parts = known.partly_finer(transport, finer)
+            # between the two: as fine in modes alone, which cost less, or in nodes alone
+            parts = [replace(transport, modes=finer.modes), replace(transport, nodes=finer.nodes)]
+            parts = [] if known.tilted else parts
             transport = next((part for part in parts if error_of(part, finer) <= MINOR_SHARE * allowed), finer)
             finer = known.finer(transport)
             error = error if finer is None else error_of(transport, finer)

@@ -55,8 +55,7 @@ class Fit:
     Attributes:
         problem: what was fitted to what.
         vector: (P,), best values in the problem's order, in physical units.
-        errors: (P,), standard errors, NaN for a parameter at a bound, infinite where the data do not identify it; those
-            of the others hold with the parameters in `at_bound` kept there.
+        errors: (P,), standard errors with the parameters in `at_bound` kept there, NaN for these; infinite: unknown.
         covariance: (P, P), of the parameters.
         cost: half the sum of squared residuals.
         at_bound: names of the parameters that ended on a bound.

@@ -83,8 +83,7 @@ def compare(
 
     Args:
         candidates: at least two fits, or posteriors of which the fits are compared, by name.
-        refit: fit each again without each incidence and rank by the elpd of the held-out measurements; this takes as
-            many short fits, and gives stacking weights and evidence as well.
+        refit: fit each again without each incidence, and rank by elpd; with stacking weights and evidence.
         options: the thresholds of verdict and notes.
         progress: called with (name and stage, done, total, note) meanwhile.
 
@@ -190,14 +189,21 @@ class Average:
         ]
         if len({part.degrees_of_freedom for part in parts}) > 1:
             raise ValueError("average: the fits differ in the tails of their noise")
-        means, scales, softness, sds = (np.concatenate(same) for same in zip(*map(_logarithmic, parts), strict=True))
+        means, scales, softness, sds = [], [], [], []
+        for part in parts:  # all of the logarithm, (D, M, C), which is linear where one predicts values themselves
+            linear = LINEAR * float(np.max(np.abs(part.means)) or 1.0)
+            size = 1.0 if part.softness is not None else linear
+            means.append(part.means / size)
+            scales.append(part.scales / size)
+            softness.append(np.broadcast_to(linear if part.softness is None else part.softness, part.means.shape))
+            sds.append(np.zeros_like(part.means) if part.discrepancy_sd is None else part.discrepancy_sd)
         return replace(
             parts[0],
             values=np.concatenate([part.values for part in parts]),
-            means=means,
-            scales=scales,
-            softness=softness,
-            discrepancy_sd=None if all(part.discrepancy_sd is None for part in parts) else sds,
+            means=np.concatenate(means),
+            scales=np.concatenate(scales),
+            softness=np.concatenate(softness),
+            discrepancy_sd=None if all(part.discrepancy_sd is None for part in parts) else np.concatenate(sds),
             seed=seed,
             pareto_k=float(np.fmax.reduce([part.pareto_k for part in parts])),
             effective_draws=sum(part.effective_draws for part in parts),
@@ -237,12 +243,3 @@ def average(
         words = f"it must give each of {', '.join(candidates)} a number of at least 0"
         raise ValueError(f"weights is {dict(weights)}; {words}")
     return Average(dict(candidates), {name: weights[name] / total for name in candidates})
-
-
-def _logarithmic(part: Prediction) -> tuple[np.ndarray, ...]:
-    """Means, scales, softness and standard deviations of the discrepancy, (D, M, C) each, of the `logarithm`."""
-    sd = np.zeros_like(part.means) if part.discrepancy_sd is None else part.discrepancy_sd
-    if part.softness is not None:
-        return part.means, part.scales, np.broadcast_to(part.softness, part.means.shape), sd
-    softness = np.full(part.means.shape, LINEAR * float(np.max(np.abs(part.means)) or 1.0))
-    return part.means / softness, part.scales / softness, softness, sd

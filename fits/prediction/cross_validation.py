@@ -154,15 +154,14 @@ class ModelScore:
 
     elpd: sum of log predictive densities of measurements, each by a fit without its incidence. elpd_diff: how far it is
     below the best; dse: standard error of the difference, by the incidences and by the draws of the posterior.
-    least_diff: the difference a measurement, of the incidence where that is least. clear_diff: the difference less its
-    error (see `ComparisonOptions`). weight: of stacking (Yao, Vehtari, Simpson & Gelman 2018, Bayesian Anal. 13, 917).
+    clear_diff: the difference less its error, or all of it where every group of held-out data decides (see
+    `ComparisonOptions`). weight: of stacking (Yao, Vehtari, Simpson & Gelman 2018, Bayesian Anal. 13, 917).
     model_probability: of this stack among those compared, equally probable a priori.
     """
 
     elpd: float
     elpd_diff: float
     dse: float
-    least_diff: float
     clear_diff: float
     weight: float
     evidence: Evidence
@@ -209,13 +208,12 @@ def rank_models(
         gaps = best.elpd_by_group - one.elpd_by_group
         elpd_diff, dse = float(gaps.sum()), float(np.sqrt(gaps.size) * gaps.std(ddof=1))
         dse = math.hypot(dse, 0.0 if one is best else math.hypot(one.error, best.error))
-        least_diff = float(np.min(gaps / [best.log_density[rows].size for rows in best.rows]))
-        decisive = least_diff > options.decisive_per_measurement
+        sizes = [best.log_density[rows].size for rows in best.rows]
+        decisive = bool(np.all(gaps / sizes > options.decisive_per_measurement))
         scores[name] = ModelScore(
             elpd=one.elpd,
             elpd_diff=elpd_diff,
             dse=dse,
-            least_diff=least_diff,
             clear_diff=elpd_diff if decisive else elpd_diff - options.standard_errors * dse,
             weight=float(weight),
             evidence=evidences[name],

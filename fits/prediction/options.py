@@ -18,8 +18,7 @@ class ComparisonOptions:
         clear_difference: above this difference hardly any doubt remains; between the two a preference is slight.
         max_pareto_k: of importance weights, above which the evidence is unreliable (Vehtari et al. 2024).
         max_reduced_chi_square: if that of every model is above this, a note says that none explains the data.
-        min_incidences: cross-validation holds out one incidence at a time if there are so many, and parts of every scan
-            if there are fewer, as a fit of one incidence says little of another.
+        min_incidences: cross-validation holds out one incidence at a time, of fewer than so many parts of every scan.
         scan_parts: parts of equal size that every scan is then divided into.
         monte_carlo_error: standard error that the elpd of a group of held-out data may have because draws of the
             posterior are few: more are taken until it is below this, or until there are `most_draws`.

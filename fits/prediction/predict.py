@@ -9,7 +9,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import jax
 import jax.numpy as jnp
@@ -35,9 +35,6 @@ from fits.sampling.posterior import Posterior
 from fits.sampling.proposals import Density
 from layerjax._checks import in_short, require_count, require_kind, require_number, require_seed
 from layerjax.compiling import programs_kept
-
-if TYPE_CHECKING:
-    from fits.prediction.compare import Average
 
 # quantiles of a `Summary`: the ends of the central 50 % and 95 % intervals, and the median
 LEVELS = (0.025, 0.25, 0.5, 0.75, 0.975)
@@ -238,15 +235,20 @@ def scores(prediction: Prediction, measurements: Measurements, rows: NDArray[np.
     )
 
 
+class Predictor(Protocol):
+    """Several fits that predict as one: see `fits.average`."""
+
+    def predict(self, at: Geometry | Measurements, *, draws: int, seed: int) -> Prediction: ...
+
+
 @programs_kept()
 def predict(
-    fitted: "Fit | Posterior | Average", at: Geometry | Measurements, *, draws: int = DRAWS, seed: int = 0
+    fitted: Fit | Posterior | Predictor, at: Geometry | Measurements, *, draws: int = DRAWS, seed: int = 0
 ) -> Prediction:
     """Predict the BSDF along other directions, and new measurements of it.
 
     Args:
-        fitted: a posterior; or a fit, whose posterior is sampled by importance (see `fits.evidence`), of a part of a
-            joint fit by its normal approximation; or an average.
+        fitted: a posterior, an average, or a fit: by importance (see `fits.evidence`), a joint one's part as normal.
         at: pairs of directions, above a stack with a base; of `Measurements` the used samples, with their own sigma.
         draws: draws of the posterior, at least 2.
         seed: random seed of draws and noise.
@@ -287,7 +289,24 @@ def posterior_predictive(
         require_visible("predict", problem.stack, light=at.wi, viewer=at.wo)
         values = np.zeros((len(at), len(channels)))  # of what refuses bad directions
         data = Measurements(at.wi, at.wo, values, None, np.ones(len(at), bool), channels)
-    vectors, pareto_k, effective = _posterior_draws(fitted, draws, np.random.default_rng(seed), proposal)
+
+    # draws of the posterior, (D, P), the Pareto k of their weights, and their effective sample size
+    generator, pareto_k, effective = np.random.default_rng(seed), math.nan, float(draws)
+    if isinstance(fitted, Posterior):
+        vectors = generator.choice(fitted.samples, draws, axis=0, replace=len(fitted.samples) < draws)
+        effective = _resampled_size(draws, float(np.min(fitted.effective_samples)))
+    else:
+        random = np.random.RandomState(generator.integers(2**31))
+        if fit.dataset is not None:  # the other data sets of a joint fit constrain it as well: in its covariance
+            positions = normal_draws(fit, draws, random)
+        else:
+            pool = max(MIN_PROPOSALS, 2 * draws)
+            weighted = importance_draws(fit, pool, random, max_pareto_k=MAX_PARETO_K, proposal=proposal)
+            positions, pareto_k = weighted.resample(random, draws), weighted.pareto_k
+            effective = _resampled_size(draws, weighted.effective_sample_size)
+        vectors = np.asarray(jax.vmap(problem.model.box.constrain)(jnp.asarray(positions)), float)
+
+    # what the stack has there, the discrepancy, and noise
     values = np.asarray(problem.predict_at(vectors, data.wi, data.wo), float)
     means = values = np.broadcast_to(values, (*values.shape[:2], len(channels)))
     softness, discrepancy_sd, sigma = None, None, _stated_sigma(fit, values, data.sigma)
@@ -318,25 +337,6 @@ def posterior_predictive(
         effective_draws=effective,
         measurements=data if isinstance(at, Measurements) else None,
     )
-
-
-def _posterior_draws(
-    fitted: Fit | Posterior, draws: int, generator: np.random.Generator, proposal: Density | None = None
-) -> tuple[Floats, float, float]:
-    """Draws (D, P) of the posterior, the Pareto k of their weights, and their effective sample size."""
-    if isinstance(fitted, Posterior):
-        vectors = generator.choice(fitted.samples, draws, axis=0, replace=len(fitted.samples) < draws)
-        return vectors, math.nan, _resampled_size(draws, float(np.min(fitted.effective_samples)))
-    random, pareto_k, effective = np.random.RandomState(generator.integers(2**31)), math.nan, float(draws)
-    if fitted.dataset is not None:  # the other data sets of a joint fit constrain it as well: in its covariance
-        positions = normal_draws(fitted, draws, random)
-    else:
-        weighted = importance_draws(
-            fitted, max(MIN_PROPOSALS, 2 * draws), random, max_pareto_k=MAX_PARETO_K, proposal=proposal
-        )
-        positions, pareto_k = weighted.resample(random, draws), weighted.pareto_k
-        effective = _resampled_size(draws, weighted.effective_sample_size)
-    return np.asarray(jax.vmap(fitted.problem.model.box.constrain)(jnp.asarray(positions)), float), pareto_k, effective
 
 
 def _resampled_size(draws: int, pool: float) -> float:

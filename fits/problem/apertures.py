@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 import layerjax as lj
 from fits.data.geometry import TANGENT_COSINE, Floats
-from fits.problem.parameters import at_start, is_free
+from fits.problem.parameters import at_start
 from layerjax.mixture import stacks_of
 
 MOST_RINGS, MOST_OF_TWO = 8, 4  # rings of a cone, and of each of two
@@ -45,8 +45,7 @@ def ring_counts(
     In the tangent plane there is nothing to take the mean of.
 
     source, detector: full angles of the cones, degrees. stack: of free parameters the end counts at which lobes are
-    narrowest; of anything but stacks one ring is taken everywhere, or `most`. tilt: degrees by which the sample may be
-    tilted, besides. most: rings; None: as many as are ever taken.
+    narrowest; of anything but stacks one ring is taken everywhere, or `most`. tilt: of the sample, at most, in degrees.
     """
     both = source > 0.0 and detector > 0.0
     seen = np.minimum(np.abs(wi[:, 2]), np.abs(wo[:, 2])) > TANGENT_COSINE
@@ -76,8 +75,7 @@ def _narrowest(material: lj.Stack | lj.Mixture) -> tuple[float, float]:
     for stack in stacks_of(material):
         for part in (*stack.layers, stack.base):
             if isinstance(part, lj.Interface | lj.Conductor):
-                least = part.alpha.arrays()[1] if is_free(part.alpha) else np.asarray(part.alpha)
-                facets.append(float(np.min(least)))
+                facets.append(float(np.min(at_start(part.alpha, 1))))
             elif isinstance(part, lj.Medium | lj.TurbidMedium):
                 for end in (1, 2):  # at the lower bounds of what is free, and at the upper
                     phase = at_start(part.phase, end)

@@ -162,7 +162,16 @@ def _cones(
         discs = rays(int(rings), *(width > 0.0 for width in widths))
         weights, parts = discs.weights[:, None], []
         for w, width, disc in zip((wi[rows], wo[rows]), widths, discs[:2], strict=True):
-            parts.append(_over_disc(w, math.radians(0.5 * width), disc))
+            # places on the unit disc become directions (K, M, 3) of the cone about w, areas solid angles
+            square = np.sum(disc**2, axis=-1)
+            cosine = 1.0 - (1.0 - math.cos(math.radians(0.5 * width))) * square
+            sine = np.sqrt((1.0 - cosine) * (1.0 + cosine))
+            across = disc * (sine / np.where(square > 0.0, np.sqrt(square), 1.0))[:, None]
+            # unit vectors across w, along the horizon and in its plane with the normal: both turn with the azimuth
+            forward = _horizontal(w)
+            along = np.stack([-forward[:, 1], forward[:, 0], np.zeros(len(w))], axis=-1)
+            sideways = across[:, :1, None] * np.cross(along, w) + across[:, 1:, None] * along
+            parts.append(cosine[:, None, None] * w + sideways)
             # light that would come or go below the horizon is not there
             weights = weights * np.maximum(parts[-1][..., 2] * np.sign(w[:, 2]), 0.0) / np.abs(w[:, 2])
         for found, part, w in ((lights, parts[0], wi[rows]), (views, parts[1], wo[rows])):
@@ -170,18 +179,6 @@ def _cones(
         row.append(np.tile(rows, len(weights)))
         share.append(weights.ravel())
     return (np.concatenate(lights), np.concatenate(views)), np.concatenate(row), np.concatenate(share)
-
-
-def _over_disc(w: Floats, radius: float, disc: Floats) -> Floats:
-    """Directions (K, M, 3) of a cone about w (M, 3), as places (K, 2) on the unit disc: areas become solid angles."""
-    square = np.sum(disc**2, axis=-1)
-    cosine = 1.0 - (1.0 - math.cos(radius)) * square
-    sine = np.sqrt((1.0 - cosine) * (1.0 + cosine))
-    across = disc * (sine / np.where(square > 0.0, np.sqrt(square), 1.0))[:, None]
-    # unit vectors across w, along the horizon and in its plane with the normal: both turn with the azimuth
-    forward = _horizontal(w)
-    along = np.stack([-forward[:, 1], forward[:, 0], np.zeros(len(w))], axis=-1)
-    return cosine[:, None, None] * w + across[:, :1, None] * np.cross(along, w) + across[:, 1:, None] * along
 
 
 def _horizontal(w: Floats, normal: float = 0.0) -> Floats:

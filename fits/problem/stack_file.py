@@ -316,12 +316,6 @@ def material_to_dict(material: lj.Stack | lj.Mixture) -> dict[str, Any]:
     return tables if material.base is None else tables | {"base": _module_to_dict(material.base)}
 
 
-def _changed_to_dict(thing: Noise | Instrument | Discrepancy | Free) -> dict[str, Any]:
-    """What is not as it is by default."""
-    every = {entry.name: (getattr(thing, entry.name), entry.default) for entry in fields(thing)}
-    return {name: _to_plain(value) for name, (value, default) in every.items() if value != default}
-
-
 def transport_to_dict(transport: lj.Transport | Literal["auto"]) -> str | dict[str, Any]:
     """The inverse of `transport_from_dict`: a name where that says all."""
     if isinstance(transport, str):
@@ -340,10 +334,10 @@ def _module_to_dict(module: Any) -> dict[str, Any]:
 def _to_plain(value: Any) -> Any:
     if isinstance(value, str | bool | int):
         return value
-    if isinstance(value, Free | Noise | Instrument):
-        return _changed_to_dict(value)
-    if isinstance(value, Discrepancy):
-        return _changed_to_dict(value) or True
+    if isinstance(value, Free | Noise | Instrument | Discrepancy):  # what is not as it is by default
+        every = {entry.name: (getattr(value, entry.name), entry.default) for entry in fields(value)}
+        changed = {name: _to_plain(one) for name, (one, default) in every.items() if one != default}
+        return changed or (True if isinstance(value, Discrepancy) else {})
     if isinstance(value, lj.PhaseFunction | Prior | PowerLaw):
         return _module_to_dict(value)
     array = np.asarray(value)

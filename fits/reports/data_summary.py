@@ -13,9 +13,7 @@ from fits.data.scans import AT_NORMAL, SAME_ANGLE, in_plane, incidences, relativ
 from fits.data.totals import Totals
 from fits.reports.tables import Table, degrees, shortened
 
-MOST_CHANNELS, MOST_ENERGIES, MOST_ANGLES = 6, 6, 24
-"""Shown one by one: channels, incidences with an energy, and incidences in a line."""
-
+MOST_CHANNELS, MOST_ENERGIES, MOST_ANGLES = 6, 6, 24  # shown one by one: channels, energies, incidences in a line
 BRIGHTER = 1.3  # ratio of the brightest measurements of two sides above which one side is the brighter beyond noise
 SAME_PLACE = 0.05  # degrees within which two measurements are repeats of one
 LEAST_COVERED = 0.5  # share of the projected hemisphere that must be covered for an integral over it

@@ -24,8 +24,7 @@ from fits.problem.stack_file import material_to_dict
 from fits.reports import tables, verdicts
 from fits.reports.data_summary import source_rows
 from fits.reports.pages import Part, Table, document, html_table, image, made_with, section, sentences, verdict
-from fits.reports.plots import model
-from fits.reports.plots.data import as_png, totals_picture
+from fits.reports.plots import data as pictures
 from fits.reports.results import REPORT
 from fits.reports.verdicts import ReportOptions, reportable
 from fits.sampling.posterior import Posterior
@@ -67,20 +66,19 @@ class FitReport:
         compared: list[Part] = [source]
         if isinstance(data, Totals):
             caption = "Shares of the incident flux with one sigma, and those of the fit."
-            compared.append(_picture(totals_picture(data, fit), caption))
+            compared.append(_picture(pictures.totals_picture(data, fit), caption))
         else:
-            caption = "In the plane of incidence, with one sigma of the noise model; grey points were not used."
-            if fit.problem.noise.discrepancy:
-                caption += " Residuals are those of the curve with model discrepancy."
-            if self.estimates is not None:
-                caption += " The interval is that of the posterior, without discrepancy and noise."
-            compared.append(_picture(model.curves_picture({self.name: fit}, self.estimates), caption))
+            caption = (
+                "In the plane of incidence, with one sigma of the noise model; grey points were not used. With model "
+                "discrepancy, residuals include it; intervals of the posterior do not."
+            )
+            compared.append(_picture(pictures.curves_picture({self.name: fit}, self.estimates), caption))
             caption = "From above, forward to the right, rings at 30°, 60° and 90°; star: the light."
-            compared.append(_picture(model.maps_picture(fit), caption))
+            compared.append(_picture(pictures.maps_picture(fit), caption))
         if self.held_out is not None and self.predicted is not None:
             compared.append(tables.scores_table(self.predicted, self.held_out, "Held-out data"))
             caption = "Held-out data in the plane of incidence, and their prediction; sigma: that of the prediction."
-            compared.append(_picture(model.prediction_picture(self.predicted, self.held_out), caption))
+            compared.append(_picture(pictures.prediction_picture(self.predicted, self.held_out), caption))
 
         # what the data identify
         count = f"{len(fit.unidentified)} of {len(facts.words)}" if fit.unidentified else "No"
@@ -90,13 +88,13 @@ class FitReport:
         )
 
         # the posterior, as far as there is one
-        sampling: list[Part] = ["<p>Not sampled. <code>layerjax sample DIR</code> samples it.</p>"]
-        if not fit.is_posterior:
-            sampling = ["<p>There is none: the objective is a named residual, not a likelihood.</p>"]
+        sampling: list[Part] = ["<p>There is none: the objective is a named residual, not a likelihood.</p>"]
+        if fit.is_posterior:
+            sampling = ["<p>Not sampled. <code>layerjax sample DIR</code> samples it.</p>"]
         if self.posterior is not None:
             sampling = [verdicts.sampled(self.posterior)]
             if self.estimates is not None:
-                corner = model.corner_picture(self.estimates)
+                corner = pictures.corner_picture(self.estimates)
                 sampling.append(tables.posterior_table(self.estimates))
                 sampling.append(_picture(corner, "Samples of the posterior; orange: the best fit."))
 
@@ -118,14 +116,14 @@ class FitReport:
         if self.others:
             found = compare({self.name: self.estimates or fit, **self.others})
             picture = _picture(
-                model.curves_picture({self.name: fit, **fits_of(self.others)}), "The fits beside the data."
+                pictures.curves_picture({self.name: fit, **fits_of(self.others)}), "The fits beside the data."
             )
             body.append(section("Comparison", found.verdict.splitlines(), tables.comparison_table(found), picture))
         return document(title, [*body, made_with()])
 
 
 def _picture(figure: Figure | None, caption: str) -> str:
-    return "" if figure is None else image(as_png(figure), caption)
+    return "" if figure is None else image(pictures.as_png(figure), caption)
 
 
 # In a notebook: results lie below reports and do not import them, but call these functions when they are shown.

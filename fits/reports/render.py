@@ -84,8 +84,7 @@ def render(
 def sphere(stack: lj.Stack | lj.Mixture, prepared: Prepared, light: tuple[float, float, float], size: int) -> Floats:
     """Radiance of the pixels of a sphere, (size, size, 3), linear, each the mean of `SAMPLES` by `SAMPLES` points.
 
-    An irradiance of pi `SUN` across the light, a sky of radiance `SKY`, a viewer far away, and a picture 1.04 times as
-    wide as the sphere. light: towards it, of any length, as in `LIGHTS`.
+    An irradiance of pi `SUN` across the light (see `LIGHTS`), a sky of radiance `SKY`, and a viewer far away.
     """
     number = SAMPLES * size
     place = ((np.arange(number) + 0.5) / number * 2.0 - 1.0) * 1.04

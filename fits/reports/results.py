@@ -17,17 +17,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from fits._files import (
-    given_path,
-    locked,
-    read_json,
-    replacing,
-    require_switch,
-    require_there,
-    text_checksum,
-    write_json,
-    write_text,
-)
+from fits import _files as files
 from fits.data.formats.csv import write_csv
 from fits.data.measurements import Measurements, Source
 from fits.data.reading import read
@@ -82,7 +72,7 @@ def write_fit(fit: Fit, folder: Path, text: str | None = None) -> None:
     spheres = data.spheres if isinstance(data, Totals) else None  # which the file cannot hold
     write_csv(data, folder / DATA)
     if text is not None:
-        write_text(folder / PROBLEM, text)
+        files.write_text(folder / PROBLEM, text)
     else:
         settings = {name: getattr(problem, name) for name in ("noise", "scale", "objective", "instrument")}
         write_problem(folder / PROBLEM, problem.stack, transport=transport, **settings)
@@ -98,9 +88,9 @@ def write_fit(fit: Fit, folder: Path, text: str | None = None) -> None:
         **{name: getattr(fit, name) for name in numbers},
         "fit": {name: plain[name] for name in _FIELDS},
         "alternatives": [k for k, one in enumerate(fit.minima) if any(one is same for same in fit.alternatives)],
-        "checksums": {name: text_checksum(folder / name) for name in (DATA, PROBLEM)},
+        "checksums": {name: files.text_checksum(folder / name) for name in (DATA, PROBLEM)},
     }
-    write_json(folder / FIT, content)
+    files.write_json(folder / FIT, content)
 
 
 def load_fit(directory: str | Path) -> Fit:
@@ -109,16 +99,16 @@ def load_fit(directory: str | Path) -> Fit:
     Raises:
         ValueError, FileNotFoundError: on one line, for a directory that holds none, a damaged one, or none at all.
     """
-    directory = given_path("directory", directory)
-    require_there(directory, "no such directory")
+    directory = files.given_path("directory", directory)
+    files.require_there(directory, "no such directory")
     if not (directory / FIT).is_file():
         raise ValueError(f"{directory}: is not a result directory, it holds no {FIT}")
-    content = read_json(directory / FIT)
+    content = files.read_json(directory / FIT)
     if (version := content.get("layerjax_result")) != SCHEMA:
         raise ValueError(f"{directory / FIT}: is version {version} of the format, must be {SCHEMA}")
     for name in (DATA, PROBLEM):
-        require_there(directory / name)
-        if text_checksum(directory / name) != content.get("checksums", {}).get(name):
+        files.require_there(directory / name)
+        if files.text_checksum(directory / name) != content.get("checksums", {}).get(name):
             raise ValueError(f"{directory / name}: damaged or changed since the fit, its checksum is not that in {FIT}")
     try:
         # the problem: stack file and data, with what the fit chose beside them
@@ -172,11 +162,11 @@ def load_posterior(directory: str | Path) -> Posterior | None:
         FileNotFoundError: there is no such directory.
         ValueError: on one line, for a damaged file.
     """
-    directory = given_path("directory", directory)
-    require_there(directory, "no such directory")
+    directory = files.given_path("directory", directory)
+    files.require_there(directory, "no such directory")
     if not (directory / CHAIN).is_file():
         return None
-    summary = read_json(directory / SUMMARY) if (directory / SUMMARY).is_file() else {}
+    summary = files.read_json(directory / SUMMARY) if (directory / SUMMARY).is_file() else {}
     try:
         posterior = load(load_fit(directory), directory / CHAIN)
     except NoSteps:
@@ -205,7 +195,7 @@ def save_posterior(posterior: Posterior, directory: str | Path) -> None:
             for name, estimates in posterior.summary().items()
         },
     }
-    write_json(Path(directory) / SUMMARY, content, force=True)
+    files.write_json(Path(directory) / SUMMARY, content, force=True)
 
 
 # ---- directories ----
@@ -222,7 +212,7 @@ def check_directory(directory: Path, force: bool) -> None:
     if not force:
         raise ValueError(f"{directory}: holds a result already (--force, or force=True, replaces it)")
     if (directory / LOCK).exists():
-        with locked(directory / LOCK, str(directory)):
+        with files.locked(directory / LOCK, str(directory)):
             pass
 
 
@@ -235,11 +225,11 @@ def writing(directory: str | Path, force: bool = False) -> Iterator[Path]:
     Raises:
         ValueError: another process writes it; or it is not empty, unless `force` is given and it is an earlier result.
     """
-    directory = given_path("directory", directory)
-    require_switch("force", force)
+    directory = files.given_path("directory", directory)
+    files.require_switch("force", force)
     check_directory(directory, force)
     target = directory.resolve()
-    with locked(target.with_name(f".{target.name}.lock"), str(directory)), replacing(target) as folder:
+    with files.locked(target.with_name(f".{target.name}.lock"), str(directory)), files.replacing(target) as folder:
         try:
             yield folder
         except OSError as error:

@@ -237,8 +237,7 @@ def scores_table(prediction: Prediction, data: Measurements, title: str) -> Tabl
 def prediction_csv(prediction: Prediction) -> str:
     """A row for each pair of directions and channel: angles in degrees, all else in 1/sr.
 
-    Columns `bsdf_...` are the best estimate, of the stack with the model discrepancy; `predictive_...` of a new
-    measurement; `latent_...` of the stack without the discrepancy.
+    Columns `bsdf_...`: the stack with discrepancy; `predictive_...`: a new measurement; `latent_...`: the stack alone.
     """
     out = io.StringIO()
     numbers: dict[str, np.ndarray] = {}

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from fits import Direction, Fit, Free, Noise, Problem, fit, slices
 from fits.data.scans import correlation, neighbours, signed_angle
 from fits.reports import tables, verdicts
-from fits.reports.plots.model import bsdf, curves_picture, misfit
+from fits.reports.plots.data import bsdf, curves_picture, misfit
 from fits.reports.verdicts import assess, identifiability, standardised
 from tests.helpers.models import along, drawn_discrepancy, line
 
