@@ -38,8 +38,8 @@ class Source:
     attribution: str = ""
 
 
+# what to do where something else is given for `Measurements`
 TO_HAVE_THEM = "fits.read(path) reads a file, fits.Measurements(wi, wo, values, ...) holds arrays"
-"""What to do where something else is given for `Measurements`."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Any
 
+from fits.problem.stack_file import check_keys
 from layerjax._checks import require_number
 
 
@@ -39,7 +40,5 @@ DEFAULT = FitOptions()
 
 def options_from(table: Mapping[str, Any]) -> FitOptions:
     """The options that the ``[options]`` of a stack file changes. ValueError for a key that is none of them."""
-    known = [entry.name for entry in fields(FitOptions)]
-    if unknown := [key for key in table if key not in known]:
-        raise ValueError(f"[options] has an unknown key {unknown[0]!r}; it must be one of {', '.join(known)}")
+    check_keys("[options]", table, tuple(entry.name for entry in fields(FitOptions)))
     return FitOptions(**table)

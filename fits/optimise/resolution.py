@@ -178,11 +178,8 @@ def with_rings(problem: Problem, vector: Floats, most: int | None = None) -> Pro
 # ---- refinement of an optimum ----
 
 
-class Choice(NamedTuple):
-    """What a fit may choose of a data set: among resolutions of its transport, if that has any; how many rays."""
-
-    resolutions: Resolutions | None
-    rays: bool
+# what a fit may choose of a data set: among resolutions of its transport, if that has any; and how many rays
+Choice = tuple[Resolutions | None, bool]
 
 
 class Accuracy(NamedTuple):
@@ -194,7 +191,7 @@ class Accuracy(NamedTuple):
 
 def for_starts(problem: FittingProblem) -> tuple[FittingProblem, dict[str, Choice]]:
     """The problem as starts are fitted, coarsely where that is open, and the choices of its data sets by name."""
-    choices = {name: Choice(resolutions(one), leaves_rays_open(one)) for name, one in problem.problems.items()}
+    choices = {name: (resolutions(one), leaves_rays_open(one)) for name, one in problem.problems.items()}
     coarse = {}
     for name, (known, rays) in choices.items():
         one = problem.problems[name]
@@ -232,8 +229,8 @@ def _judged(
     problem: Problem, choice: Choice, vector: Floats, predicted: Floats, options: FitOptions, progress: Progress
 ) -> tuple[Problem, Accuracy | None]:
     """The data set at the resolution that its noise asks for, and how accurate it is now."""
-    needed, errors, note = problem, [], ""
-    if (known := choice.resolutions) is not None:
+    (known, rays), needed, errors, note = choice, problem, [], ""
+    if known is not None:
         transport = own = transport_of(problem, known)
         progress("numerical error", 0, None, f"at {known.in_words(own)}")
         error_of, allowed = error_between(problem, own, vector, predicted), options.numerical_error
@@ -252,7 +249,7 @@ def _judged(
             needed = replace(needed, transport=transport)
         errors.append(error)
     if has_rays(problem):
-        needed = with_rings(needed, vector) if choice.rays else needed
+        needed = with_rings(needed, vector) if rays else needed
         other = problem.with_other_rays().predict(vector) if needed is problem else np.nan
         errors.append(float(np.max(np.abs(predicted - np.asarray(other)) / spread(problem, vector, predicted))))
     if not errors:

@@ -192,13 +192,6 @@ class Fit:
         """The stack with the best values."""
         return self.problem.build(self.vector).stack
 
-    @cached_property
-    def scale(self) -> float | tuple[float, ...]:
-        """The calibration factor, one number or one a channel. ValueError for a fit of several measurements."""
-        self.require_one("scale")
-        scale = np.asarray(self.problem.build(self.vector).scale, float)
-        return float(scale) if scale.ndim == 0 else tuple(scale.tolist())
-
     @property
     def is_posterior(self) -> bool:
         """Whether the objective was a likelihood, so that errors are those of a posterior."""

@@ -7,10 +7,6 @@
     thickness = { start = 0.5, low = 0.0, high = 5.0, prior = { kind = "Normal", mean = 0.5, sd = 0.2 } }
     phase = { kind = "SGGX", shape = "surface", alpha = 0.3 }
 
-    [base]
-    kind = "Lambertian"
-    albedo = [0.1, 0.2, 0.3]                   # one number, or one a channel
-
 ``docs/guides/own_data.md`` says what else may stand there. Keys are the parameters of the classes of the same name; the
 `kind` of an SGGX is called `shape` here. Bad input is a ValueError on one line that names place and parameter.
 """

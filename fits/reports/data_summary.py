@@ -77,15 +77,16 @@ def doubtful_angles(data: Measurements) -> list[str]:
     largest = np.max(data.theta_i if total else np.concatenate([data.theta_i, data.theta_o]), initial=0.0)
     if 0.0 < largest < 1.6:  # a little more than a right angle in radians
         words.append(f"Angles: none is above {largest:.4g}°: are they radians? They were read as degrees.")
-    if total or not (seen := sides(data)):
+    if total or not len(found := sides(data)):
         return words
-    brighter = [one for one in seen if one.light > BRIGHTER * max(one.mirror, 0.0)]
-    if all(math.isnan(one.mirror) for one in seen):
+    theta, light, mirror = found.T
+    brighter, darker = light > BRIGHTER * np.maximum(mirror, 0.0), mirror > BRIGHTER * np.maximum(light, 0.0)
+    if np.isnan(mirror).all():
         where = "all measurements in the plane of incidence lie on the light's side"
-    elif len(brighter) > sum(one.mirror > BRIGHTER * max(one.light, 0.0) for one in seen):
-        worst = max(brighter, key=lambda one: one.light)
-        where = f"the brightest side is the light's: at {worst.theta:g}° up to {worst.light:.3g} there"
-        where = f"{where}, and {worst.mirror:.3g} on the mirror side"
+    elif np.count_nonzero(brighter) > np.count_nonzero(darker):
+        worst = np.argmax(np.where(brighter, light, -np.inf))
+        where = f"the brightest side is the light's: at {theta[worst]:g}° up to {light[worst]:.3g} there"
+        where = f"{where}, and {mirror[worst]:.3g} on the mirror side"
     else:
         return words
     return [
@@ -141,14 +142,6 @@ class Energy(NamedTuple):
     theta: float
     share: tuple[float, ...]
     covered: float
-
-
-class Sides(NamedTuple):
-    """Brightest measurements in the plane of incidence on the sides of light and mirror; NaN if that was not seen."""
-
-    theta: float
-    light: float
-    mirror: float
 
 
 def reciprocity(data: Measurements) -> Agreement | None:
@@ -207,24 +200,23 @@ def energies(data: Measurements) -> list[Energy]:
     return result
 
 
-def sides(data: Measurements) -> list[Sides]:
-    """Brightest measurements of each scan in the plane of incidence, over the angles that both sides cover."""
-    used = _above(data)
-    angle, coplanar, result = signed_angle(used), in_plane(used), []
-    for rows in scans(used):
-        rows = rows[coplanar[rows]]
-        if not rows.size or used.theta_i[rows[0]] < STEEP:
+def sides(data: Measurements) -> NDArray[np.float64]:
+    """Incidence, and the brightest measurements on the sides of light and mirror, of each scan in its plane, (K, 3).
+
+    They are over the angles that both sides cover; NaN if only the light's was measured.
+    """
+    used, result = _above(data), []
+    angle, coplanar = signed_angle(used), in_plane(used)
+    for rows in (rows[coplanar[rows]] for rows in scans(used)):
+        if not rows.size or used.theta_i[rows[0]] < STEEP or angle[rows].min() >= -SAME_ANGLE:
             continue
         theta, level = angle[rows], used.values[rows].mean(axis=1)
-        if theta.min() >= -SAME_ANGLE:
-            continue
         one_sided = theta.max() <= SAME_ANGLE
         limit = np.inf if one_sided else min(theta.max(), -theta.min()) + SAME_ANGLE
         light, mirror = (level[(sign * theta > SAME_ANGLE) & (sign * theta <= limit)] for sign in (-1, 1))
         if light.size and (mirror.size or one_sided):
-            brightest = np.nan if one_sided else float(mirror.max())
-            result.append(Sides(float(used.theta_i[rows[0]]), float(light.max()), brightest))
-    return result
+            result.append((used.theta_i[rows[0]], light.max(), np.nan if one_sided else mirror.max()))
+    return np.array(result).reshape(-1, 3)
 
 
 def _above(data: Measurements) -> Measurements:

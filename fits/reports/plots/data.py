@@ -82,7 +82,8 @@ def data_picture(data: Measurements) -> Figure:
                     rows = incidence.rows[flat[incidence.rows]]
                     draw_points(axes, data, rows, channel, colour, incidence.label, data.sigma)
                 value_axis(axes, data.values[flat], value_label(data, channel))
-            panels[0].legend(loc="best", ncols=2 if len(shown) > 4 else 1)
+            if panels[0].get_legend_handles_labels()[0]:
+                panels[0].legend(loc="best", ncols=2 if len(shown) > 4 else 1)
             parts[0].supxlabel(ANGLE_LABEL, fontsize="medium")
         if maps:
             values = np.where(data.mask, data.values[:, 0], np.nan)
