@@ -131,11 +131,7 @@ def _lobes(axes: Axes, prepared: Prepared, transmits: bool) -> None:
         wi = lj.direction(-np.radians(incidence), 0.0)
         value = np.asarray(lj.evaluate(prepared, wi, wo) * jnp.abs(wo[:, 2:])).mean(axis=-1)
         axes.plot(angle, np.sqrt(value), color=colour, label=f"{incidence:.0f}°")
-    axes.set_theta_zero_location("N")  # type: ignore[attr-defined]
-    axes.set_theta_direction(-1)  # type: ignore[attr-defined]
-    if not transmits:
-        axes.set_thetamin(-90)  # type: ignore[attr-defined]
-        axes.set_thetamax(90)  # type: ignore[attr-defined]
+    axes.set(theta_zero_location="N", theta_direction=-1, **({} if transmits else {"thetamin": -90, "thetamax": 90}))
     axes.yaxis.set_major_locator(MaxNLocator(4))
     axes.set_title("√(f |cos θₒ|), 1/√sr, in the plane of incidence", pad=14)
     axes.legend(title="incidence", loc="lower left", bbox_to_anchor=(-0.3, -0.05))

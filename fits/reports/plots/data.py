@@ -126,8 +126,8 @@ def totals_picture(totals: Totals, fit: Fit | None = None) -> Figure:
                 ticks = range(0, len(channels), -(-len(channels) // 12))
                 axes.set_xticks(ticks, [channels[place] for place in ticks], rotation=45, ha="right")
             axes.margins(y=0.1)
-            axes.set_ylim(bottom=0.0)
-            axes.set_title("collimated transmittance" if kind == "unscattered" else f"total {kind}")
+            title = "collimated transmittance" if kind == "unscattered" else f"total {kind}"
+            axes.set(ylim=(0.0, None), title=title)
             marks |= {label: handle for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)}
         panels[0].set_ylabel("share of the incident flux")
         figure.legend(list(marks.values()), list(marks), loc="outside lower center", ncols=min(len(marks), 6))
@@ -400,8 +400,7 @@ def value_axis(axes: Axes, values: np.ndarray, label: str) -> None:
     norm = value_norm(values)
     low, high = norm.vmin or 0.0, norm.vmax or 0.0
     if isinstance(norm, LogNorm):
-        axes.set_yscale("log")
-        axes.set_ylim(low / 1.6, 1.6 * high)
+        axes.set(yscale="log", ylim=(low / 1.6, 1.6 * high))
         axes.yaxis.set_major_locator(mpl.ticker.LogLocator(subs=(1.0,) if high > 1e3 * low else (1.0, 2.0, 5.0)))
         axes.yaxis.set_major_formatter(mpl.ticker.StrMethodFormatter("{x:g}"))
         axes.yaxis.set_minor_formatter(mpl.ticker.NullFormatter())
