@@ -121,10 +121,7 @@ def resolutions(problem: Problem) -> Resolutions | None:
 def error_between(
     problem: Problem, transport: lj.AddingDoubling, vector: Floats, predicted: Floats
 ) -> Callable[[lj.AddingDoubling, lj.AddingDoubling], float]:
-    """Largest difference between two resolutions, in standard deviations of the data; NaN if one is not finite.
-
-    predicted: with the vector (P,) at the resolution of `transport`. Values count in the measure of a named objective.
-    """
+    """Largest difference between two resolutions, in sigma of the data; `predicted` is at that of `transport`."""
     values, sd = {transport: predicted}, spread(problem, vector, predicted)
 
     def measured(one: lj.AddingDoubling) -> Floats:

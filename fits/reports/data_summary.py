@@ -145,10 +145,7 @@ class Energy(NamedTuple):
 
 
 def reciprocity(data: Measurements) -> Agreement | None:
-    """Pairs in which light and viewer change places, both above the surface; None if there is none.
-
-    If all measurements lie on one side of the plane of incidence, the sample is taken to be symmetric about it.
-    """
+    """Pairs in which light and viewer change places; None without any. Data of one side of the plane are mirrored."""
     used = _above(data)
     if not len(used):
         return None
@@ -201,10 +198,7 @@ def energies(data: Measurements) -> list[Energy]:
 
 
 def sides(data: Measurements) -> NDArray[np.float64]:
-    """Incidence, and the brightest measurements on the sides of light and mirror, of each scan in its plane, (K, 3).
-
-    They are over the angles that both sides cover; NaN if only the light's was measured.
-    """
+    """Incidence, and the brightest on the sides of light and mirror (NaN: not measured) of each scan, (K, 3)."""
     used, result = _above(data), []
     angle, coplanar = signed_angle(used), in_plane(used)
     for rows in (rows[coplanar[rows]] for rows in scans(used)):

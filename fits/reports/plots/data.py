@@ -64,10 +64,7 @@ def as_png(figure: Figure, trimmed: bool = True) -> bytes:
 
 
 def data_picture(data: Measurements) -> Figure:
-    """What a file holds: in-plane values against angle, one panel per channel, and maps where data leaves the plane.
-
-    Of more than six channels some are shown, evenly spaced and with both ends.
-    """
+    """What a file holds: in-plane values against angle, a panel for each of six channels, and maps out of plane."""
     data = data.of_channels(evenly_spaced(data.channels, MOST_CHANNELS))
     flat, shown, maps = in_plane(data), chosen(data), mapped(data)
     colours = mpl.colormaps["viridis"](np.linspace(0.0, 0.85, len(shown)))  # dark to light
@@ -96,8 +93,7 @@ def data_picture(data: Measurements) -> Figure:
 
 
 def totals_picture(totals: Totals, fit: Fit | None = None) -> Figure:
-    """A panel for each kind: measured shares of the incident flux, and those of the fit, against the channel, or the
-    angle of incidence where there is but one channel; a colour for each angle."""
+    """A panel for each kind of share of the incident flux: measured and fitted, against channel or angle."""
     kinds, channels = [kind for kind in KINDS if kind in totals.kinds], totals.channels
     angles, single = sorted(set(totals.theta_i)), len(channels) == 1
     marks: dict[str, Any] = {}
@@ -144,17 +140,13 @@ def bsdf(fit: Fit) -> np.ndarray:
 
 
 def misfit(fit: Fit) -> np.ndarray:
-    """Measurements less `bsdf`, in units of the noise, (N, C); NaN in rows that were not used.
-
-    With a model discrepancy these are smaller than the noise, since it follows the data: `standardised` are not.
-    """
+    """Measurements less `bsdf`, which follows the data, in units of the noise, (N, C); NaN in unused rows."""
     independent = np.asarray(fit.problem.call(Model.offsets_after_discrepancy_at, fit.vector, fit.predicted), float)
     return over_all_rows(fit, independent / residual_unit(fit))
 
 
 class Curve(NamedTuple):
-    """A model along one incidence: viewing angles (M,), BSDF (M, C), that of the stack without model discrepancy, and
-    the ends of an interval, (2, M, C); None where there is no discrepancy, or no interval."""
+    """A model along one incidence: angles (M,), BSDF (M, C), that without discrepancy, and an interval, (2, M, C)."""
 
     angle: Floats
     values: Floats
@@ -202,10 +194,7 @@ def _panels(
     residuals: list[Floats],
     sigma: Floats | None,
 ) -> Figure:
-    """A panel for each incidence with data, their sigma (N, C) and models, and residuals (N, C) of each below.
-
-    Every incidence has an axis of its own: linear, or logarithmic where its values span a wide range.
-    """
+    """A panel for each incidence with data, their sigma (N, C) and models, and residuals (N, C) of each below."""
     signed, columns = signed_angle(data), 1 if len(shown) == 1 else 2 if len(shown) <= 4 else 3
     blocks = -(-len(shown) // columns)
     coloured = len(data.channels) > 1 and len(curves) == 1  # by channel, else by model
