@@ -25,9 +25,9 @@ from fits.optimise.fit import fit as fit
 from fits.optimise.options import FitOptions as FitOptions
 from fits.optimise.result import Fit as Fit
 from fits.optimise.uncertainty import Direction as Direction
-from fits.prediction.average import Average as Average
-from fits.prediction.average import average as average
+from fits.prediction.compare import Average as Average
 from fits.prediction.compare import Comparison as Comparison
+from fits.prediction.compare import average as average
 from fits.prediction.compare import compare as compare
 from fits.prediction.cross_validation import ModelScore as ModelScore
 from fits.prediction.cross_validation import cross_validate as cross_validate

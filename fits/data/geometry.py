@@ -94,8 +94,7 @@ def slices(
         outgoing: signed polar angles of the detector in each plane, in [-180, 180]; positive is the side at `azimuth`.
             Default -85 to 85 in steps of 5. Beyond +-90 looks at transmitted light.
         azimuth: one or more planes through the normal, as the azimuth of their positive side, in [-360, 360]; 0 is the
-            plane of incidence, with the mirror direction on the positive side. The normal itself is taken once for
-            each incidence.
+            plane of incidence, mirror direction on the positive side. The normal is taken once for each incidence.
 
     Returns:
         All pairs of an incidence with a detector position, the incidences one after the other.

@@ -38,8 +38,8 @@ class Source:
     attribution: str = ""
 
 
+# what to do where something else is given for `Measurements`
 TO_HAVE_THEM = "fits.read(path) reads a file, fits.Measurements(wi, wo, values, ...) holds arrays"
-"""What to do where something else is given for `Measurements`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,8 +56,7 @@ class Measurements(Pairs):
         source: where the samples came from.
 
     Raises:
-        ValueError: shapes do not fit together, a number is not finite or too large, a direction is no unit vector, or
-            sigma is negative, or next to zero in a sample that is used.
+        ValueError: shapes do not fit together, or values, directions or sigma are out of range.
     """
 
     wi: Floats
@@ -92,16 +91,12 @@ class Measurements(Pairs):
         if self.sigma is not None:
             if (self.sigma < 0).any():
                 raise ValueError(f"sigma is {self.sigma.min():g}, must be >= 0")
-            least = np.min(self.sigma[self.mask], initial=np.inf)
-            if least < SMALLEST_SIGMA:
-                raise ValueError(
-                    f"sigma is {least:g} in a sample that is used, must be > 0, at least {SMALLEST_SIGMA:g} "
-                    "(sigma=None where it is unknown)"
-                )
+            if (least := np.min(self.sigma[self.mask], initial=np.inf)) < SMALLEST_SIGMA:
+                words = f"must be > 0, at least {SMALLEST_SIGMA:g} (sigma=None where it is unknown)"
+                raise ValueError(f"sigma is {least:g} in a sample that is used, {words}")
 
     def __repr__(self) -> str:
-        masked = int((~self.mask).sum())
-        note = f", {masked:,} of them masked" if masked else ""
+        note = "" if self.mask.all() else f", {np.count_nonzero(~self.mask):,} of them masked"
         name = self.source.path or f"{self.source.format} data"
         return f"<Measurements: {len(self):,} data points{note}, of {', '.join(self.channels)}, from {name}>"
 
@@ -170,10 +165,8 @@ class Measurements(Pairs):
         if channels is not None and angles:
             raise ValueError("drop: channels are given together with angles; drop one after the other")
         own = self.select(channels=channels, **angles).channels
-        if channels is None:
-            rest: Measurements = self.where(~rows_of(self, **angles)).used()
-        else:
-            rest = self.used().of_channels([name for name in self.channels if name not in own])
+        others = [name for name in self.channels if channels is None or name not in own]
+        rest = (self if channels is not None else self.where(~rows_of(self, **angles))).used().of_channels(others)
         if not rest.values.size:
             raise ValueError("drop: no sample of the data remains")
         return rest
@@ -193,9 +186,9 @@ class Measurements(Pairs):
         )
 
     def without_retro(self, degrees: float) -> "Measurements":
-        """The same samples, those closer than `degrees` (0 to 180) to retro-reflection masked.
+        """The same samples, masked closer than `degrees` (0 to 180) to retro-reflection, where the detector stands.
 
-        A detector head blocks the beam there. Raises ValueError for an angle out of range.
+        Raises ValueError for an angle out of range.
         """
         _check_angle(degrees, 180.0)
         angle = np.degrees(2 * np.arcsin(np.clip(np.linalg.norm(self.wi - self.wo, axis=-1) / 2, 0, 1)))

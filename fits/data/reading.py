@@ -45,14 +45,11 @@ class ReadOptions(FileOptions):
             Radiance), "fred", "astm" (E1392), "pab", "alta", "speos" or "ssdd"; None finds out from the content.
         quantity: what the numbers in the file are: "brdf", f in 1/sr; "brdf_cos", f |cos theta_o|; or
             "reflectance_factor", pi f. A CSV says so in its column names, and then this picks among them; Zemax,
-            LightTools, FRED and ASTM files hold "brdf" unless this says otherwise; ALTA files that do not say what they
-            hold need it; all others say it themselves.
-        geometry: for MERL and RGL only, the directions to look up; None: of MERL the default `slices`, of RGL the
-            directions at which the file has values.
+            LightTools, FRED and ASTM files hold "brdf" unless this says otherwise; ALTA files may need it.
+        geometry: for MERL and RGL only, the directions to look up; None: the default `slices`, or those of RGL's file.
         lookup: for MERL only, "centre" or "linear": see `fits.data.formats.merl.read`.
         bins: for MERL and RGL only: so many bins, or nodes, from all over the table, at most 100,000, or "all".
-        strata: for MERL only, what each of these bins stands for an equal share of: "bins" of the table, or "flux",
-            the projected solid angle of light and viewer.
+        strata: for MERL only, what bins are equal shares of: "bins" of the table, or "flux", projected solid angles.
         seed: of their choice.
         wavelengths, corrected: for iad's files only: see `read_slab`.
         min_retro_angle: mask measurements closer than so many degrees to retro-reflection.
@@ -68,9 +65,8 @@ class ReadOptions(FileOptions):
 
     def __post_init__(self) -> None:
         for name, high in (("min_retro_angle", 180.0), ("max_polar_angle", 90.0)):
-            if not (
-                (angle := getattr(self, name)) is None or (isinstance(angle, Real) and 0.0 <= float(angle) <= high)
-            ):
+            angle = getattr(self, name)
+            if not (angle is None or (isinstance(angle, Real) and 0.0 <= float(angle) <= high)):
                 raise ValueError(f"{name} is {angle!r:.60}, must be in [0, {high:g}] degrees")
         for name in ("select", "hold_out"):
             if not isinstance(words := getattr(self, name), list | tuple):
@@ -107,15 +103,13 @@ class ReadOptions(FileOptions):
         if isinstance(data, Totals):
             for name in ("min_retro_angle", "max_polar_angle", "select", "hold_out"):
                 if getattr(self, name):
-                    option = name.replace("_", "-")
-                    raise ValueError(
-                        f"{path}: holds totals, which have no outgoing direction; --{option} does not apply"
-                    )
+                    words = f"which have no outgoing direction; --{name.replace('_', '-')} does not apply"
+                    raise ValueError(f"{path}: holds totals, {words}")
             return data, None
         data = self._masked(data)
-        kept = [select(data, words) for words in self.select if not words.startswith(CHANNELS)]
-        keep = np.all(kept, axis=0) if kept else np.ones(len(data), bool)
-        held = np.any([select(data, words) for words in self.hold_out], axis=0) if self.hold_out else ~keep & False
+        keep, held = np.ones(len(data), bool), np.zeros(len(data), bool)
+        keep = np.all([keep, *(select(data, words) for words in self.select if not words.startswith(CHANNELS))], axis=0)
+        held = np.any([held, *(select(data, words) for words in self.hold_out)], axis=0)
         fitted = data.where(keep & ~held)
         if data.mask.any() and not fitted.mask.any():
             raise ValueError(f"{path}: --select and --hold-out leave nothing to fit")

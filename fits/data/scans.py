@@ -36,8 +36,7 @@ class Incidence:
 def incidences(data: Pairs) -> list[Incidence]:
     """The distinct incident directions, by polar angle then azimuth.
 
-    Directions within `SAME_ANGLE` count as the same, as an instrument does not return to an angle to the last digit;
-    near the normal all azimuths are therefore one.
+    Directions within `SAME_ANGLE` count as the same, as no instrument repeats an angle to the last digit.
     """
     theta = data.theta_i
     phi = np.where(theta < AT_NORMAL, LIGHT_AZIMUTH, data.phi_i)
@@ -114,17 +113,16 @@ def scans(data: Pairs) -> list[np.ndarray]:
 
 def neighbours(data: Pairs, residuals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Residuals (N, C) of neighbours in a scan, two arrays; rows with NaN are skipped."""
-    # The mean is not subtracted: a bias over a stretch of angle is structure too.
-    pairs = []
+    first, second = [np.empty(0)], [np.empty(0)]
     for rows in scans(data):
         scan = residuals[rows][np.isfinite(residuals[rows]).all(axis=-1)]
-        pairs.append((scan[:-1].ravel(), scan[1:].ravel()))
-    first, second = zip(*pairs, strict=True) if pairs else ([np.empty(0)], [np.empty(0)])
+        first.append(scan[:-1].ravel())
+        second.append(scan[1:].ravel())
     return np.concatenate(first), np.concatenate(second)
 
 
 def correlation(first: np.ndarray, second: np.ndarray) -> float:
-    """Correlation of pairs about zero; NaN for no pairs."""
+    """Correlation of pairs about zero, as a bias over a stretch of angle is structure too; NaN for no pairs."""
     norm = np.sqrt(np.sum(first**2) * np.sum(second**2))
     return float(np.sum(first * second) / norm) if norm > 0.0 else float("nan")
 
@@ -195,15 +193,13 @@ def _at(measured: NDArray[np.float64], name: str, angles: Angles, turn: float = 
         return (measured >= low) & (measured <= high)
     chosen = np.zeros(len(measured), bool)
     for angle in np.atleast_1d(np.asarray(angles, float)):
-        distance = np.abs(measured - angle)
-        if not math.isinf(turn):
-            distance = np.minimum(distance % turn, turn - distance % turn)
-        near = distance <= SAME_ANGLE
+        apart = np.abs(measured - angle) % turn
+        near = np.minimum(apart, turn - apart) <= SAME_ANGLE
         if not near.any():
             there = np.unique(measured)
-            words = f"there are {', '.join(f'{one:g}' for one in there)}"
-            if len(there) > LISTED:
-                words = f"they go from {there[0]:g} to {there[-1]:g}"
+            words = f"they go from {there[0]:g} to {there[-1]:g}"
+            if len(there) <= LISTED:
+                words = f"there are {', '.join(f'{one:g}' for one in there)}"
             raise ValueError(f"{name} {angle:g} is not in the data; {words} degrees")
         chosen |= near
     return chosen

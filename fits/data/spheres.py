@@ -2,16 +2,14 @@
 
 Light that a sample reflects or transmits into a sphere reaches the detector by way of the wall, as a baffle blocks the
 direct path, and some of it illuminates the sample again, diffusely; between two spheres it may cross the sample several
-times. After Pickering et al.
-1993 (Appl. Opt. 32, 399) and Prahl's iad: with area fractions a_s, a_e, a_d of the ports for sample, entrance and
-detector and a_w of the wall, reflectances r_w of the wall and r_d of the detector, and the sample's reflectance r_s and
-transmittance t_s of diffuse light,
+times. After Pickering et al. 1993 (Appl. Opt. 32, 399) and Prahl's iad: with area fractions a_s, a_e, a_d of the ports
+for sample, entrance and detector and a_w of the wall, reflectances r_w of the wall and r_d of the detector, and the
+sample's reflectance r_s and transmittance t_s of diffuse light,
 
     G = 1 / (1 - r_w (a_w + (1 - a_e)(a_d r_d + a_s r_s))),
     G_11 = G / (1 - a_s a_s' r_w r_w' (1 - a_e)(1 - a_e') G G' t_s^2).
 
-Collimated transmittance and specular reflection count like the rest, wherever they meet the wall first; light lost at
-the edges of the sample is neglected.
+Collimated transmittance and specular reflection count like the rest; light lost at the edges is neglected.
 """
 
 import math

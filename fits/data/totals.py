@@ -25,8 +25,7 @@ class Totals(Measurements):
         wo: (N, 3), specular or undeviated direction, in the hemisphere that the light is measured in.
         values, sigma: (N, C), shares of the incident light, in [0, 1].
         kinds: N names, of `KINDS`.
-        spheres: integrating spheres of the measurement, which the model then includes; None for values of the sample
-            itself.
+        spheres: integrating spheres, which the model then includes; None for values of the sample itself.
     """
 
     kinds: tuple[Kind, ...] = ()
@@ -36,9 +35,8 @@ class Totals(Measurements):
         super().__post_init__()
         if len(self.kinds) != len(self.values):
             raise ValueError(f"kinds has {len(self.kinds)} names, must be {len(self.values)}")
-        for kind in self.kinds:
-            if kind not in KINDS:
-                raise ValueError(f"kinds holds {kind!r}, must be one of {', '.join(KINDS)}")
+        if unknown := [kind for kind in self.kinds if kind not in KINDS]:
+            raise ValueError(f"kinds holds {unknown[0]!r}, must be one of {', '.join(KINDS)}")
         if (self.values < 0).any():
             raise ValueError(f"values holds {self.values.min():g}, must be at least 0")
         if (self.wi[:, 2] <= 0).any():

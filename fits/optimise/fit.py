@@ -37,7 +37,7 @@ from fits.optimise.result import OUTCOMES, Fit, Minimum, WithoutDiscrepancy
 from fits.optimise.uncertainty import UNCONSTRAINED_BEYOND
 from fits.problem.instrument import Instrument
 from fits.problem.model import Transport
-from fits.problem.noise import DEFAULT_RELATIVE, Noise
+from fits.problem.noise import Noise
 from fits.problem.parameters import Free
 from fits.problem.problem import FittingProblem, Problem
 from fits.progress import Progress, given_progress, silent
@@ -71,17 +71,14 @@ def fit(
         stack: holds `Free` where a number is to be fitted; or a `Problem` or `Joint`, in which all else is said.
         data: only the samples that its mask leaves in are used.
         transport: see `Problem`. A resolution that is not given is chosen: coarse for the starts, at the end so fine
-            that the numerical error of the model stays below a tenth of the data's standard deviation, where that is
-            within reach. `Fit.problem` has it.
+            that the model's numerical error is below a tenth of the data's sigma, where that is within reach.
         noise, scale, objective, instrument: see `Problem`.
         starts: at least 1: the `Free.start` values, then scrambled Sobol points of the box (in the logarithm for
-            parameters with a `LogNormal` or `LogUniform` prior), drawn with `seed`. The lowest end of all is the fit;
-            where a parameter ends on a bound, L-BFGS-B checks it.
+            parameters with a `LogNormal` or `LogUniform` prior), drawn with `seed`. The lowest end of all is the fit.
         options: tolerances and thresholds.
         progress: called with ("fit", starts done, starts, note).
         checkpoint: a file that each start is kept in as it ends: a fit that was killed takes those that are there for
-            done. It stays, as does one beside it for a second fit with model discrepancy; one of another problem is
-            replaced.
+            done. It stays, as does one beside it for a second fit; one of another problem is replaced.
         screen: stay at the resolution of the starts, do not estimate its error, continue only the starts that are
             lowest after a few steps, and stop near the minimum: enough to rank stacks.
 
@@ -93,12 +90,10 @@ def fit(
         arguments: dict[str, Any] = {"data": data, "noise": noise, "scale": scale, "instrument": instrument}
         arguments |= {"transport": None if transport == "auto" else transport}
         arguments |= {"objective": None if objective == "likelihood" else objective}
-        for name, given in arguments.items():
-            if given is not None:
-                raise ValueError(f"{name} is given beside a {type(stack).__name__}, which says it all")
+        if given := [name for name, value in arguments.items() if value is not None]:
+            raise ValueError(f"{given[0]} is given beside a {type(stack).__name__}, which says it all")
     else:
-        noise = Noise() if noise is None else noise
-        problem = Problem(stack, cast(Measurements, data), transport, noise, scale, objective, instrument)
+        problem = Problem(stack, cast(Measurements, data), transport, noise or Noise(), scale, objective, instrument)
     require_count("starts", starts, 1)
     require_seed(seed)
     require_switch("screen", screen)
@@ -106,8 +101,25 @@ def fit(
     require_kind("options", options, FitOptions)
     run = _Run(starts, seed, options, given_progress(progress), checkpoint, screen)
     independent = _fit_from(problem, start_points(problem, starts, seed), run)
-    before = {name: found for name in problem.problems if (found := _refuted(independent.part(name), options))}
-    return _with_discrepancy(problem, independent, before, run) if before else independent
+    without = {name: found for name in problem.problems if (found := _refuted(independent.part(name), options))}
+    if not without:
+        return independent
+
+    # again with model discrepancy of these data sets: from the minima of the fit without, and a few other points
+    sets = {name: problem.problems[name] for name in without}
+    sets = {name: replace(one, noise=replace(one.noise, discrepancy=True)) for name, one in sets.items()}
+    whole, points = problem.with_problems(sets), []
+    for minimum in independent.minima[:MOST_STARTS]:
+        values = dict(zip(whole.names, whole.start, strict=True)) | minimum.values
+        points.append(unit_of(whole, np.array([values[name] for name in whole.names])))
+    others = start_points(whole, min(starts, MOST_STARTS // 2), seed)
+
+    def progress_again(stage: str, done: int, total: int | None = None, info: str = "") -> None:
+        run.progress(f"{stage} with model discrepancy", done, total, info)
+
+    checkpoint = None if checkpoint is None else discrepancy_checkpoint(checkpoint)
+    again = run._replace(progress=progress_again, checkpoint=checkpoint)
+    return _fit_from(whole, np.concatenate([points, others]), again, without)
 
 
 def refit(problem: Problem, *vectors: Floats) -> Fit:
@@ -133,50 +145,24 @@ class _Run(NamedTuple):
     screen: bool = False
 
 
-def without_discrepancy(fit: Fit) -> WithoutDiscrepancy:
-    """What is to be said of a fit without model discrepancy."""
+def _refuted(fit: Fit, options: FitOptions) -> WithoutDiscrepancy | None:
+    """What is to be said of a fit whose residuals show that it needs model discrepancy, where that is left to them."""
+    possible = fit.problem.noise.tails == "gaussian" and fit.is_posterior and not isinstance(fit.problem.data, Totals)
+    if fit.problem.noise.discrepancy is not None or not possible:
+        return None
     pairs = neighbours(fit.problem.data.used(), fit.residuals)
+    found = correlation(*pairs)
+    if not (found * math.sqrt(pairs[0].size) > options.autocorrelation_errors and found > options.autocorrelation):
+        return None
     return WithoutDiscrepancy(
         values=fit.values,
         errors=fit.standard_errors,
         chi_square=fit.chi_square,
         degrees_of_freedom=fit.degrees_of_freedom,
         log_likelihood=fit.log_likelihood,
-        residual_autocorrelation=correlation(*pairs),
+        residual_autocorrelation=found,
         pairs=pairs[0].size,
     )
-
-
-def _refuted(independent: Fit, options: FitOptions) -> WithoutDiscrepancy | None:
-    """What is to be said of a fit whose residuals are correlated, where it is left to these; else None."""
-    problem = independent.problem
-    possible = problem.noise.tails == "gaussian" and independent.is_posterior and not isinstance(problem.data, Totals)
-    if problem.noise.discrepancy is not None or not possible:
-        return None
-    found = without_discrepancy(independent)
-    errors = found.residual_autocorrelation * math.sqrt(found.pairs)
-    clear = errors > options.autocorrelation_errors and found.residual_autocorrelation > options.autocorrelation
-    return found if clear else None
-
-
-def _with_discrepancy(
-    problem: FittingProblem, independent: Fit, before: Mapping[str, WithoutDiscrepancy], run: _Run
-) -> Fit:
-    """The fit with model discrepancy of these data sets: from the minima of that without, and a few other points."""
-    sets = {name: problem.problems[name] for name in before}
-    sets = {name: replace(one, noise=replace(one.noise, discrepancy=True)) for name, one in sets.items()}
-    whole, points = problem.with_problems(sets), []
-    for minimum in independent.minima[:MOST_STARTS]:
-        values = dict(zip(whole.names, whole.start, strict=True)) | minimum.values
-        points.append(unit_of(whole, np.array([values[name] for name in whole.names])))
-    others = start_points(whole, min(run.starts, MOST_STARTS // 2), run.seed)
-
-    def progress(stage: str, done: int, total: int | None = None, info: str = "") -> None:
-        run.progress(f"{stage} with model discrepancy", done, total, info)
-
-    checkpoint = None if run.checkpoint is None else discrepancy_checkpoint(run.checkpoint)
-    again = run._replace(progress=progress, checkpoint=checkpoint)
-    return _fit_from(whole, np.concatenate([points, others]), again, before)
 
 
 def _fit_from(
@@ -201,31 +187,12 @@ def _fit_from(
 
 
 def _result(at: Optimum, accuracy: Accuracy | None, run: _Run, without: Mapping[str, WithoutDiscrepancy]) -> Fit:
-    """The fit of an optimum: values, errors, minima, and its status in words."""
-    problem, lowest, found, options, total = at.problem, at.lowest, at.uncertainty, run.options, len(at.ends)
+    """The fit of an optimum: values, errors, minima."""
+    problem, lowest, found, options = at.problem, at.lowest, at.uncertainty, run.options
     at_bound = tuple(name for name, held in zip(problem.names, found.at_bound, strict=True) if held)
     minima, outcomes = _minima(problem, at, options)
     equivalent = options.equivalent_cost * at.excess
     alternatives = tuple(minimum for minimum in minima[1:] if minimum.cost - lowest.cost < equivalent)
-    status = [
-        f"converged; {outcomes['best minimum']} of {total} starts converged to the best minimum"
-        if lowest.converged
-        else f"not converged: the lowest of {total} starts did not; these are the best values seen"
-    ]
-    others = {word: outcomes[key] for key, word in OUTCOMES.items() if key != "best minimum"}
-    status += [f"{count} of {total} starts {word}" for word, count in others.items() if count]
-    if at_bound:
-        status.append(f"at a bound: {', '.join(at_bound)}; the errors of the others hold with them kept there")
-    if alternatives:
-        words = f"{len(alternatives)} more local minima fit equally well"
-        status.append(f"errors are conditional on this local minimum; {words}")
-    if problem.objective != "likelihood":
-        words = "the errors are scaled by its scatter, no posterior"
-        status.append(f"objective {problem.objective} is no likelihood: {words}")
-    elif any(one.noise_is_assumed for one in problem.problems.values()):
-        status.append(f"a noise of {100.0 * DEFAULT_RELATIVE:g} % of the model's value was assumed, none is stated")
-    status += ["L-BFGS-B improved on Levenberg-Marquardt"] if at.improved else []
-    status += [] if accuracy is None else [accuracy.words]
     result = Fit(
         problem=cast(Problem, problem),  # or a `Joint`, of whose data sets `Fit.part` says more
         vector=lowest.vector,
@@ -234,7 +201,6 @@ def _result(at: Optimum, accuracy: Accuracy | None, run: _Run, without: Mapping[
         cost=lowest.cost,
         at_bound=at_bound,
         converged=lowest.converged,
-        status="; ".join(status),
         iterations=lowest.steps,
         condition_number=found.condition_number,
         unidentified=found.unidentified,
@@ -291,7 +257,6 @@ def _minima(problem: FittingProblem, at: Optimum, options: FitOptions) -> tuple[
             values=dict(zip(problem.names, map(float, ends[leader].vector), strict=True)),
             cost=float(cost[leader]),
             count=count,
-            stack=problem.build(ends[leader].vector).stack,
         )
         for leader, count in zip(leaders, counts, strict=True)
     )

@@ -1,8 +1,7 @@
 """The starts of a fit: where they begin, where each of them ends, and the lowest followed to its very minimum.
 
 Levenberg-Marquardt follows them, and continues a start that reaches the maximum of steps while it gains something.
-L-BFGS-B of scipy, by jaxopt and with gradients only, shares nothing with it but the objective: it checks a minimum that
-lies on a bound or has not converged.
+L-BFGS-B of scipy, by jaxopt, shares the objective alone: it checks a minimum on a bound, or that has not converged.
 """
 
 import warnings
@@ -46,18 +45,17 @@ def multi_start(
     problem: FittingProblem, points: Floats, progress: Progress, store: Store | None = None
 ) -> list[Descent]:
     """Where each of the points (starts, P) in the unit box ends, roughly; those that are in the store are not run."""
-    ends: dict[int, Descent] = {}
+    every = range(len(points))
+    stored = {} if store is None else {index: found for index in every if (found := store.get(f"start {index}"))}
+    ends = {index: Descent(**found) for index, found in stored.items()}
 
     def ended(index: int, end: Descent) -> None:
         ends[index] = end
-        if store is not None and store.get(f"start {index}") is None:
+        if store is not None:
             store.put(f"start {index}", end._replace(gradient=None, root=None, predicted=None)._asdict())
         progress("fit", len(ends), len(points), f"best cost {min(end.cost for end in ends.values()):.6g}")
 
-    for index in range(len(points)):
-        if store is not None and (stored := store.get(f"start {index}")) is not None:
-            ended(index, Descent(**stored))
-    left = [index for index in range(len(points)) if index not in ends]
+    left = [index for index in every if index not in ends]
     for index in left[:1]:  # alone: it compiles the program, which keeps one core busy
         ended(index, rough_descent(problem, points[index]))
     pool = ThreadPoolExecutor(cores())
@@ -67,7 +65,7 @@ def multi_start(
             ended(running[future], future.result())
     finally:
         pool.shutdown(cancel_futures=True)
-    return [ends[index] for index in range(len(points))]
+    return [ends[index] for index in every]
 
 
 def starts_store(

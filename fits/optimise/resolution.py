@@ -3,8 +3,7 @@
 A resolution that is left open is that of the start values where starts run, but no finer than is useful far away from
 the data. At the optimum it is compared with finer ones, by values alone, until they agree to a tenth of the noise: only
 then are the minima that may be the best, or as good as it, fitted again, as programs of a finer resolution take seconds
-to compile. A resolution that is given is compared with a finer one, and stays. The rays that stand for the cones of an
-instrument are those that the lobe asks for that was found.
+to compile. A resolution that is given is compared with a finer one, and stays. The rays of cones follow from the lobe.
 """
 
 import warnings
@@ -22,7 +21,8 @@ from fits.data.geometry import Floats
 from fits.optimise.levenberg_marquardt import Descent
 from fits.optimise.multi_start import Optimum, polish, rough_descent, unit_of
 from fits.optimise.options import FitOptions
-from fits.problem.instrument import rings_for
+from fits.problem.apertures import ring_counts
+from fits.problem.instrument import Instrument
 from fits.problem.model import Model
 from fits.problem.problem import FittingProblem, Problem
 from fits.progress import Progress
@@ -76,13 +76,6 @@ class Resolutions:
             return None
         return None if finer == transport else finer
 
-    def partly_finer(self, transport: lj.AddingDoubling, finer: lj.AddingDoubling) -> list[lj.AddingDoubling]:
-        """Transports between the two: as fine as `finer` in modes alone, which cost less, and in nodes alone."""
-        if self.tilted:
-            return []
-        parts = [replace(transport, modes=finer.modes), replace(transport, nodes=finer.nodes)]
-        return [part for part in parts if part not in (transport, finer)]
-
     def in_words(self, transport: lj.AddingDoubling) -> str:
         """Such as "12 nodes, 16 modes"."""
         if self.tilted:
@@ -100,8 +93,7 @@ class Resolutions:
 def resolutions(problem: Problem) -> Resolutions | None:
     """Resolutions that the problem's transport may take; None if it has none.
 
-    Which transport "auto" is, is decided by what is known while tracing: a fit that passes through an index of 1 or an
-    albedo of 0 stays with one.
+    Which transport "auto" is, is decided while tracing: a fit that passes an index of 1 or albedo 0 stays with one.
     """
     transport, model = problem.transport, problem.model
     directions = model.known if model.optics is None else model.optics.known
@@ -129,11 +121,7 @@ def resolutions(problem: Problem) -> Resolutions | None:
 def error_between(
     problem: Problem, transport: lj.AddingDoubling, vector: Floats, predicted: Floats
 ) -> Callable[[lj.AddingDoubling, lj.AddingDoubling], float]:
-    """Largest difference between two resolutions, in standard deviations of the data; NaN if one is not finite.
-
-    predicted: by the problem with the vector (P,) at the resolution of `transport`. Each other is computed once, and
-    values count in the measure of a named objective if it is one.
-    """
+    """Largest difference between two resolutions, in sigma of the data; `predicted` is at that of `transport`."""
     values, sd = {transport: predicted}, spread(problem, vector, predicted)
 
     def measured(one: lj.AddingDoubling) -> Floats:
@@ -148,8 +136,7 @@ def error_between(
 
 
 def spread(problem: Problem, vector: Floats, predicted: Floats) -> Floats:
-    """Standard deviations of the data, (N, C), with noise levels as they are in `vector` (P,), and model discrepancy;
-    for a named objective the scatter of its residuals, one number."""
+    """Standard deviations of the data, (N, C), with model discrepancy; of a named objective its scatter, a number."""
     if problem.objective == "likelihood":
         sigma = np.asarray(problem.call(Model.sigma_at, vector, predicted), float)
         correlation = problem.build(vector).correlation
@@ -158,27 +145,6 @@ def spread(problem: Problem, vector: Floats, predicted: Floats) -> Floats:
     data = np.asarray(problem.call(Model.standardised_at, vector, np.zeros_like(predicted)), float)
     scatter = np.sqrt(np.sum(residuals**2) / max(problem.count - len(vector), 1))
     return np.maximum(scatter, LEAST_SCATTER * np.sqrt(np.mean(data**2)))
-
-
-def needed_resolution(
-    known: Resolutions,
-    transport: lj.AddingDoubling,
-    error: Callable[[lj.AddingDoubling, lj.AddingDoubling], float],
-    allowed: float,
-) -> tuple[lj.AddingDoubling, float, bool]:
-    """The coarsest resolution from this one on that is fine enough, its error, and whether none is finer."""
-    finer = known.finer(transport)
-    if finer is None:
-        return transport, error(known.as_stated(transport.coarser()), transport), True
-    found = error(transport, finer)
-    while known.open and found > allowed:
-        parts = known.partly_finer(transport, finer)
-        transport = next((part for part in parts if error(part, finer) <= MINOR_SHARE * allowed), finer)
-        finer = known.finer(transport)
-        if finer is None:
-            return transport, found, True
-        found = error(transport, finer)
-    return transport, found, False
 
 
 # ---- of an instrument's cones ----
@@ -194,44 +160,41 @@ def leaves_rays_open(problem: Problem) -> bool:
     return has_rays(problem) and problem.instrument is not None and problem.instrument.rings is None
 
 
-def with_rings(problem: Problem, rings: int) -> Problem:
-    """The problem with so many rings of rays a cone."""
-    return replace(problem, instrument=replace(cast(Any, problem.instrument), rings=rings))
-
-
-def rings_of_lobes(problem: Problem, vector: Floats) -> int:
-    """Rings of rays a cone that the lobes of the stack ask for with this vector (P,)."""
-    parts, data = problem.build(vector), problem.data.used()
-    return rings_for(cast(Any, problem.instrument), parts.instrument, parts.stack, data.wi, data.wo)
+def with_rings(problem: Problem, vector: Floats, most: int | None = None) -> Problem:
+    """The problem with as many rings of rays a cone as its lobes ask for at this vector (P,), and no fewer."""
+    instrument, parts, data = cast(Instrument, problem.instrument), problem.build(vector), problem.data.used()
+    tilt = 0.0 if parts.instrument.tilt is None else abs(float(parts.instrument.tilt))
+    widths = instrument.source_aperture, instrument.detector_aperture
+    rings = max(int(np.max(ring_counts(*widths, parts.stack, data.wi, data.wo, tilt))), 1)
+    rings = rings if most is None else min(rings, most)
+    if rings <= (instrument.rings or 0):
+        return problem
+    return replace(problem, instrument=replace(instrument, rings=rings))
 
 
 # ---- refinement of an optimum ----
 
 
-class Choice(NamedTuple):
-    """What a fit may choose of a data set: among resolutions of its transport, if that has any; how many rays."""
-
-    resolutions: Resolutions | None
-    rays: bool
+# what a fit may choose of a data set: among resolutions of its transport, if that has any; and how many rays
+Choice = tuple[Resolutions | None, bool]
 
 
 class Accuracy(NamedTuple):
-    """The resolution of a fit in words, the numerical error there in standard deviations, and what is said of it."""
+    """The resolution of a fit in words, and the numerical error there in standard deviations of the data."""
 
     resolution: str
     error: float
-    words: str
 
 
 def for_starts(problem: FittingProblem) -> tuple[FittingProblem, dict[str, Choice]]:
     """The problem as starts are fitted, coarsely where that is open, and the choices of its data sets by name."""
-    choices = {name: Choice(resolutions(one), leaves_rays_open(one)) for name, one in problem.problems.items()}
+    choices = {name: (resolutions(one), leaves_rays_open(one)) for name, one in problem.problems.items()}
     coarse = {}
     for name, (known, rays) in choices.items():
         one = problem.problems[name]
         if known is not None and known.open:
             one = replace(one, transport=known.far)
-        coarse[name] = with_rings(one, min(rings_of_lobes(one, one.start), FAR_RINGS)) if rays else one
+        coarse[name] = with_rings(one, one.start, FAR_RINGS) if rays else one
     changed = {name: one for name, one in coarse.items() if one is not problem.problems[name]}
     return problem.with_problems(changed), choices
 
@@ -239,8 +202,7 @@ def for_starts(problem: FittingProblem) -> tuple[FittingProblem, dict[str, Choic
 def refined(
     at: Optimum, choices: Mapping[str, Choice], options: FitOptions, progress: Progress
 ) -> tuple[Optimum, Accuracy | None]:
-    """The optimum at the resolution that the noise of each data set asks for, or at the given one; None: there is no
-    resolution."""
+    """The optimum at the resolution that the noise of each data set asks for, and how accurate it is there."""
     while True:
         changed, accuracies = {}, {}
         for name, predicted in at.problem.shares(at.predicted).items():
@@ -253,11 +215,8 @@ def refined(
         if not accuracies:
             return at, None
         if not changed:
-            resolution, words = (
-                "; ".join(f"{name}: {one[place]}" if name else str(one[place]) for name, one in accuracies.items())
-                for place in (0, 2)
-            )
-            return at, Accuracy(resolution, float(np.max([one.error for one in accuracies.values()])), words)
+            words = [f"{name}: {one.resolution}" if name else one.resolution for name, one in accuracies.items()]
+            return at, Accuracy("; ".join(words), float(np.max([one.error for one in accuracies.values()])))
         whole = at.problem.with_problems(changed)
         again = polish(whole, _fitted_again(at, whole, options.equivalent_cost, progress), check=at.improved)
         at = again._replace(improved=again.improved or at.improved)
@@ -267,27 +226,32 @@ def _judged(
     problem: Problem, choice: Choice, vector: Floats, predicted: Floats, options: FitOptions, progress: Progress
 ) -> tuple[Problem, Accuracy | None]:
     """The data set at the resolution that its noise asks for, and how accurate it is now."""
-    needed, errors, words = problem, [], []
-    if (known := choice.resolutions) is not None:
-        own = transport_of(problem, known)
+    (known, rays), needed, errors, note = choice, problem, [], ""
+    if known is not None:
+        transport = own = transport_of(problem, known)
         progress("numerical error", 0, None, f"at {known.in_words(own)}")
-        between = error_between(problem, own, vector, predicted)
-        transport, error, finest = needed_resolution(known, own, between, options.numerical_error)
-        if known.open and transport != own:
+        error_of, allowed = error_between(problem, own, vector, predicted), options.numerical_error
+        note, finer = "" if known.open else ", as given", known.finer(own)
+        error = error_of(known.as_stated(own.coarser()), own) if finer is None else error_of(own, finer)
+        while finer is not None and known.open and error > allowed:
+            # between the two: as fine in modes alone, which cost less, or in nodes alone
+            parts = [replace(transport, modes=finer.modes), replace(transport, nodes=finer.nodes)]
+            parts = [] if known.tilted else parts
+            transport = next((part for part in parts if error_of(part, finer) <= MINOR_SHARE * allowed), finer)
+            finer = known.finer(transport)
+            error = error if finer is None else error_of(transport, finer)
+        if finer is None and known.open:
+            note = ", the finest tried"
+        if transport != own:
             needed = replace(needed, transport=transport)
         errors.append(error)
-        words.append(_error_in_words(known.in_words(own), error, finest, known.open))
     if has_rays(problem):
-        rings = rings_of_lobes(problem, vector) if choice.rays else 0
-        if rings > (cast(Any, problem.instrument).rings or 0):
-            needed = with_rings(needed, rings)
+        needed = with_rings(needed, vector) if rays else needed
         other = problem.with_other_rays().predict(vector) if needed is problem else np.nan
         errors.append(float(np.max(np.abs(predicted - np.asarray(other)) / spread(problem, vector, predicted))))
-        words.append(_error_in_words(_rings_in_words(problem), errors[-1], False, choice.rays))
     if not errors:
         return problem, None
-    said = f"numerical error of the model: {', '.join(words)}"
-    return needed, Accuracy(resolution_in_words(problem, known), float(np.sum(errors)), said)  # errors add up
+    return needed, Accuracy(resolution_in_words(problem, known) + note, float(np.sum(errors)))  # errors add up
 
 
 def transport_of(problem: Problem, known: Resolutions) -> lj.AddingDoubling:
@@ -298,21 +262,8 @@ def transport_of(problem: Problem, known: Resolutions) -> lj.AddingDoubling:
 def resolution_in_words(problem: Problem, known: Resolutions | None) -> str:
     """The resolution of a problem whose transport may have one."""
     parts = [] if known is None else [known.in_words(transport_of(problem, known))]
-    return ", ".join(parts + ([_rings_in_words(problem)] if has_rays(problem) else []))
-
-
-def _rings_in_words(problem: Problem) -> str:
-    rings = cast(Any, problem.instrument).rings or 1
-    return f"{rings} ring{'s' if rings > 1 else ''} of rays a cone"
-
-
-def _error_in_words(resolution: str, error: float, finest: bool, is_open: bool) -> str:
-    """finest: the resolution is the finest tried, so that the error is that of a coarser one."""
-    if not np.isfinite(error):
-        return f"not known at {resolution}"
-    if finest:
-        return f"up to {error:.2g} sigma at {resolution}{', the finest tried' if is_open else ''}"
-    return f"{error:.2g} sigma at most at {resolution}{'' if is_open else ', as given'}"
+    rings = cast(Any, problem.instrument).rings or 1 if has_rays(problem) else 0
+    return ", ".join(parts + ([f"{rings} ring{'s' if rings > 1 else ''} of rays a cone"] if rings else []))
 
 
 def _fitted_again(at: Optimum, problem: FittingProblem, equivalent: float, progress: Progress) -> list[Descent]:

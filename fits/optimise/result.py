@@ -1,5 +1,6 @@
 """The outcome of a fit: values, how far to trust them, and what else would explain the data."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -24,12 +25,11 @@ OUTCOMES = {
 
 @dataclass(frozen=True, eq=False)
 class Minimum:
-    """A minimum that `count` starts reached: values by name, half the sum of squared residuals, and the stack."""
+    """A minimum that `count` starts reached: values by name, and half the sum of squared residuals."""
 
     values: dict[str, float]
     cost: float
     count: int
-    stack: Any
 
 
 @dataclass(frozen=True)
@@ -55,26 +55,23 @@ class Fit:
     Attributes:
         problem: what was fitted to what.
         vector: (P,), best values in the problem's order, in physical units.
-        errors: (P,), standard errors, NaN for a parameter at a bound, infinite where the data do not identify it; those
-            of the others hold with the parameters in `at_bound` kept there.
+        errors: (P,), standard errors with the parameters in `at_bound` kept there, NaN for these; infinite: unknown.
         covariance: (P, P), of the parameters.
         cost: half the sum of squared residuals.
         at_bound: names of the parameters that ended on a bound.
         converged: whether the best start did.
-        status: how the fit ended, in words.
         iterations: steps of the solver to the best minimum.
         condition_number: of the information about the parameters, each scaled to unit length.
         unidentified: the directions in the space of parameters that the data alone do not identify, worst first.
         minima: the minima that starts reached, best first.
         alternatives: those among `minima`, other than the best, that fit equally well (local minima of the same model).
-            `errors` and `covariance` are of the best alone; `fits.sample`, `fits.predict` and `fits.evidence` count all
-            that hold a share of the posterior.
+            `errors` are of the best alone; `fits.sample`, `fits.predict` and `fits.evidence` count all.
         insensitive: names of the parameters that the data say nothing about.
         settings: starts, seed, and the numbers of `FitOptions`.
         start_outcomes: how many starts ended where: "best minimum", "local minima", "maximum steps reached", "failed".
         numerical_error: of the model at the best values, in standard deviations of the data (for a named objective, of
-            the residuals): the largest difference from a finer resolution, or where that is out of reach from a coarser
-            one, which is more; that of the rays for an instrument's cones is added. None where there is neither.
+            the residuals): the largest difference from a finer resolution, or from a coarser one at the finest; that of
+            the rays for an instrument's cones is added. None where there is neither.
         resolution: of the transport, and the rays for cones, in words; None where there is neither. `problem` holds it.
         without_discrepancy: the fit without model discrepancy, if residuals showed that one is needed (see `Noise`).
         without_discrepancy_parts: of a `Joint`, the same by the names of measurements.
@@ -88,7 +85,6 @@ class Fit:
     cost: float
     at_bound: tuple[str, ...]
     converged: bool
-    status: str
     iterations: int
     condition_number: float
     unidentified: tuple[Direction, ...]
@@ -127,8 +123,7 @@ class Fit:
             return tuple(called[name] for name in some if name in called)
 
         def minimum(one: Minimum) -> Minimum:
-            values = {plain: one.values[whole] for whole, plain in called.items()}
-            return replace(one, values=values, stack=one.stack[name])
+            return replace(one, values={plain: one.values[whole] for whole, plain in called.items()})
 
         found = replace(
             self,
@@ -162,6 +157,22 @@ class Fit:
             raise ValueError(f"{what}: {self.dataset!r} is a part of a joint fit, and {words}")
 
     @property
+    def status(self) -> str:
+        """How the fit ended, in words."""
+        total, best = sum(self.start_outcomes.values()), self.start_outcomes.get("best minimum")
+        words = ["converged" if self.converged else "not converged, these are the best values seen"]
+        words += [f"{count} of {total} starts {OUTCOMES[how]}" for how, count in self.start_outcomes.items() if count]
+        words += ["more starts may find a better one"] if best == 1 < total else []
+        words += [f"at a bound: {', '.join(self.at_bound)}"] if self.at_bound else []
+        if self.alternatives:
+            others = f"{len(self.alternatives)} more local minima fit equally well"
+            words.append(f"errors are conditional on this local minimum; {others}")
+        if self.resolution is not None:
+            error = numerical_error_in_words(self.numerical_error)
+            words.append(f"numerical error of the model: {error} at {self.resolution}")
+        return "; ".join(words)
+
+    @property
     def values(self) -> dict[str, float]:
         """Best value of each parameter."""
         return dict(zip(self.problem.names, map(float, self.vector), strict=True))
@@ -180,13 +191,6 @@ class Fit:
     def stack(self) -> Any:
         """The stack with the best values."""
         return self.problem.build(self.vector).stack
-
-    @cached_property
-    def scale(self) -> float | tuple[float, ...]:
-        """The calibration factor, one number or one a channel. ValueError for a fit of several measurements."""
-        self.require_one("scale")
-        scale = np.asarray(self.problem.build(self.vector).scale, float)
-        return float(scale) if scale.ndim == 0 else tuple(scale.tolist())
 
     @property
     def is_posterior(self) -> bool:
@@ -235,3 +239,8 @@ class Fit:
         spread = np.sqrt(np.diagonal(self.covariance))
         spread = np.where(spread > 0, spread, np.nan)
         return self.covariance / np.outer(spread, spread)
+
+
+def numerical_error_in_words(error: float | None) -> str:
+    """How far the resolution keeps the model from its limit."""
+    return "not known" if error is None or not math.isfinite(error) else f"{error:.2g} sigma at most"

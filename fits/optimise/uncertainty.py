@@ -7,7 +7,7 @@ the fit worsens by one standard deviation, priors and bounds apart. Along a curv
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import jax.numpy as jnp
 import numpy as np
@@ -47,11 +47,10 @@ class Direction:
 
     def renamed(self, names: Mapping[str, str]) -> "Direction":
         """The same direction with those of its members that have other names, under these."""
-        weights, errors = (
-            {names[name]: value for name, value in part.items() if name in names}
-            for part in (self.weights, self.conditional_errors)
-        )
-        return replace(self, weights=weights, conditional_errors=errors)
+        members = {names[name]: name for name in self.weights if name in names}
+        weights = {new: self.weights[name] for new, name in members.items()}
+        errors = {new: self.conditional_errors[name] for new, name in members.items()}
+        return Direction(self.error, weights, errors)
 
     @property
     def unconstrained(self) -> bool:
@@ -126,12 +125,9 @@ def local_information(problem: FittingProblem, unit: Floats) -> tuple[Floats, Fl
 def condition_number(root: Floats) -> float:
     """Ratio of the extreme singular values once every column has unit length: infinite if one has no effect."""
     lengths = np.linalg.norm(root, axis=0)
-    if not lengths.size:
-        return 1.0
-    if not np.all(lengths > 0):
-        return float("inf")
-    values = np.linalg.svd(square(root / lengths), compute_uv=False)
-    return float(values[0] / values[-1]) if values[-1] > 0 else float("inf")
+    if not (lengths.size and np.all(lengths > 0)):
+        return math.inf if lengths.size else 1.0
+    return float(np.linalg.cond(square(root / lengths)))
 
 
 def unidentified_directions(root: Floats, names: tuple[str, ...], width: Floats) -> tuple[Direction, ...]:

@@ -1,4 +1,4 @@
-"""Model comparison: fits of the same measurements side by side, and which of them the data prefer."""
+"""Fits of the same measurements side by side: which of them the data prefer, and their predictions averaged."""
 
 import math
 from collections.abc import Mapping
@@ -8,13 +8,18 @@ import numpy as np
 
 from fits._files import require_switch
 from fits._lazy import shown_by
+from fits.data.geometry import Geometry
+from fits.data.measurements import Measurements
 from fits.optimise.result import Fit
 from fits.prediction.cross_validation import ModelScore, model_scores
 from fits.prediction.options import DEFAULT, ComparisonOptions
+from fits.prediction.predict import DRAWS, Prediction, predict
 from fits.progress import Progress
 from fits.sampling.posterior import Posterior
 from layerjax._checks import require_kind
 from layerjax.compiling import programs_kept
+
+LINEAR = 1e6  # softness that makes the logarithm linear, in units of the largest value: asinh(x / s) is x / s there
 
 
 @dataclass(frozen=True)
@@ -78,14 +83,12 @@ def compare(
 
     Args:
         candidates: at least two fits, or posteriors of which the fits are compared, by name.
-        refit: fit each again without each incidence and rank by the elpd of the held-out measurements; this takes as
-            many short fits, and gives stacking weights and evidence as well.
+        refit: fit each again without each incidence, and rank by elpd; with stacking weights and evidence.
         options: the thresholds of verdict and notes.
         progress: called with (name and stage, done, total, note) meanwhile.
 
     Raises:
-        ValueError: fewer than two candidates, different data, different objectives, or joint fits; a part of one may be
-            compared, but not with `refit`.
+        ValueError: fewer than two candidates, different data or objectives, joint fits, or parts of one with `refit`.
     """
     fits = fits_of(candidates)
     require_kind("options", options, ComparisonOptions, None)
@@ -93,7 +96,16 @@ def compare(
     if len(candidates) < 2:
         raise ValueError(f"compare: {len(candidates)} candidate(s) given; at least 2 are needed")
     options = options or DEFAULT
-    _require_comparable(fits)
+    for fit in fits.values():
+        fit.require_one("compare")
+    first_name, first = next(iter(fits.items()))
+    for name, fit in fits.items():
+        pairs = [(getattr(first.problem.model, one), getattr(fit.problem.model, one)) for one in ("wi", "wo", "values")]
+        if not all(a.shape == b.shape and np.allclose(a, b, rtol=1e-9, atol=1e-12) for a, b in pairs):
+            raise ValueError(f"compare: {first_name!r} and {name!r} were fitted to different data")
+        if fit.problem.objective != first.problem.objective:
+            words = f"{first_name!r} minimised {first.problem.objective!r}, {name!r} {fit.problem.objective!r}"
+            raise ValueError(f"compare: {words}; only fits of one objective can be compared")
     rows = [ComparedFit(name, fit) for name, fit in fits.items()]
     if refit:
         scores = model_scores(fits, progress, options)
@@ -106,19 +118,6 @@ def compare(
     rows.sort(key=lambda row: ranks[row.name])
     verdict = "\n".join(_verdict(rows[0], row, sorted_by, options) for row in rows[1:])
     return Comparison(tuple(rows), sorted_by, verdict, tuple(_notes(rows, options)), options)
-
-
-def _require_comparable(fits: Mapping[str, Fit]) -> None:
-    for fit in fits.values():
-        fit.require_one("compare")
-    first_name, first = next(iter(fits.items()))
-    for name, fit in fits.items():
-        pairs = [(getattr(first.problem.model, one), getattr(fit.problem.model, one)) for one in ("wi", "wo", "values")]
-        if not all(a.shape == b.shape and np.allclose(a, b, rtol=1e-9, atol=1e-12) for a, b in pairs):
-            raise ValueError(f"compare: {first_name!r} and {name!r} were fitted to different data")
-        if fit.problem.objective != first.problem.objective:
-            words = f"{first_name!r} minimised {first.problem.objective!r}, {name!r} {fit.problem.objective!r}"
-            raise ValueError(f"compare: {words}; only fits of one objective can be compared")
 
 
 def _verdict(best: ComparedFit, other: ComparedFit, sorted_by: str, options: ComparisonOptions) -> str:
@@ -167,3 +166,80 @@ def _notes(rows: list[ComparedFit], options: ComparisonOptions) -> list[str]:
     if min(row.fit.reduced_chi_square for row in rows) > options.max_reduced_chi_square:
         notes.append("no candidate explains the data within its noise: the criteria overstate differences")
     return notes
+
+
+# ---- averaging ----
+
+
+@dataclass(frozen=True, eq=False)
+class Average:
+    """Fits or posteriors of the same data, by name, and the weights of their predictions, which sum to 1."""
+
+    candidates: Mapping[str, Fit | Posterior]
+    weights: Mapping[str, float]
+
+    def predict(self, at: Geometry | Measurements, *, draws: int = DRAWS, seed: int = 0) -> Prediction:
+        """See `fits.predict`; the draws are divided between the candidates in proportion to the weights."""
+        # differences of rounded cumulative weights, which sum to all draws however many candidates there are
+        counts = np.diff(np.round(draws * np.cumsum([0.0, *self.weights.values()])))
+        parts = [
+            predict(self.candidates[name], at, draws=max(int(count), 2), seed=seed + number)
+            for number, (name, count) in enumerate(zip(self.weights, counts, strict=True))
+            if count > 0
+        ]
+        if len({part.degrees_of_freedom for part in parts}) > 1:
+            raise ValueError("average: the fits differ in the tails of their noise")
+        means, scales, softness, sds = [], [], [], []
+        for part in parts:  # all of the logarithm, (D, M, C), which is linear where one predicts values themselves
+            linear = LINEAR * float(np.max(np.abs(part.means)) or 1.0)
+            size = 1.0 if part.softness is not None else linear
+            means.append(part.means / size)
+            scales.append(part.scales / size)
+            softness.append(np.broadcast_to(linear if part.softness is None else part.softness, part.means.shape))
+            sds.append(np.zeros_like(part.means) if part.discrepancy_sd is None else part.discrepancy_sd)
+        return replace(
+            parts[0],
+            values=np.concatenate([part.values for part in parts]),
+            means=np.concatenate(means),
+            scales=np.concatenate(scales),
+            softness=np.concatenate(softness),
+            discrepancy_sd=None if all(part.discrepancy_sd is None for part in parts) else np.concatenate(sds),
+            seed=seed,
+            pareto_k=float(np.fmax.reduce([part.pareto_k for part in parts])),
+            effective_draws=sum(part.effective_draws for part in parts),
+        )
+
+
+@programs_kept()
+def average(
+    candidates: Mapping[str, Fit | Posterior],
+    weights: Mapping[str, float] | None = None,
+    *,
+    options: ComparisonOptions | None = None,
+    progress: Progress | None = None,
+) -> Average:
+    """Average over fits of the same data: predictions of the result are a mixture of theirs, see `fits.predict`.
+
+    Args:
+        candidates: fits or posteriors, by name.
+        weights: by the same names, none below 0: stacking weights (`ModelScore.weight`) predict best, model
+            probabilities (`ModelScore.model_probability`) are Bayesian model averaging. None: stacking weights, for
+            which each is fitted again without each incidence (see `cross_validate`).
+        options: of that cross-validation.
+        progress: progress of these fits, see `cross_validate`.
+
+    Raises:
+        ValueError: no candidate; weights that are missing, negative or all 0; or as `cross_validate`.
+    """
+    fits = fits_of(candidates)
+    require_kind("weights", weights, Mapping, None)
+    require_kind("options", options, ComparisonOptions, None)
+    if not candidates:
+        raise ValueError("average: there is no fit to average")
+    if weights is None:
+        weights = {name: score.weight for name, score in model_scores(fits, progress, options).items()}
+    total = float(sum(weights.get(name, np.nan) for name in candidates))
+    if set(weights) != set(candidates) or min(weights.values()) < 0.0 or not total > 0.0:
+        words = f"it must give each of {', '.join(candidates)} a number of at least 0"
+        raise ValueError(f"weights is {dict(weights)}; {words}")
+    return Average(dict(candidates), {name: weights[name] / total for name in candidates})

@@ -1,8 +1,7 @@
 """Cross-validation, and which of several stacks predicts held-out data best: elpd differences, stacking weights.
 
 A fit is repeated without one group of measurements after the other, and predicts them. A single measurement would be
-predicted well by its neighbours, whatever the stack. Groups are therefore whole incidences; of fewer than three, parts
-of every scan.
+predicted well by its neighbours, whatever the stack. Groups are whole incidences; of fewer than three, parts of scans.
 """
 
 import math
@@ -15,18 +14,16 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.special import logsumexp, softmax
 
 from fits.data.geometry import Floats
-from fits.data.measurements import Measurements
 from fits.data.scans import incidences, scans
 from fits.optimise.fit import refit
 from fits.optimise.result import Fit
-from fits.prediction.importance import Evidence, ImportanceDraws, evidence_of, posterior_draws
+from fits.prediction.importance import Evidence, ImportanceDraws, posterior_draws
 from fits.prediction.options import DEFAULT, ComparisonOptions
 from fits.prediction.predict import posterior_predictive
 from fits.problem.discrepancy import size
 from fits.problem.problem import Problem
 from fits.progress import Progress, given_progress, named
 from fits.sampling.initial import other_minima
-from fits.sampling.proposals import Density
 from layerjax._checks import require_count, require_kind, require_seed
 from layerjax.compiling import programs_kept
 
@@ -42,8 +39,7 @@ class CrossValidation:
 
     groups: names of what was held out together. rows: of each group among the used samples. log_density: log predictive
     density of each measurement, (N, C), by the fit without its group; 0 for those in no group, whose plane has too few
-    to hold some out. converged: whether all of these fits did. errors: standard error of the elpd of each group, (G,),
-    by the number of draws of the posterior.
+    to hold some out. converged: whether all fits did. errors: of each group's elpd, (G,), by the number of draws.
     """
 
     groups: tuple[str, ...]
@@ -102,31 +98,17 @@ def cross_validate(
     for number, (name, rows) in enumerate(groups.items()):
         progress("cross-validation", number, len(groups), name)
         rest = refit(without(fit.problem, np.isin(np.arange(len(data)), rows)), fit.vector, *other_minima(fit))
-        density[rows], errors[number] = _predictive_density(rest, data, rows, draws, seed, options, proposal)
-        converged &= rest.converged
+        each, effective, error = np.empty((0, *data.values[rows].shape)), 0.0, math.inf
+        while not len(each) or (error > options.monte_carlo_error and len(each) < options.most_draws):
+            prediction = posterior_predictive(rest, data, draws=draws, seed=seed + len(each), proposal=proposal)
+            each = np.concatenate([each, prediction.log_densities(data.values)[:, rows]])
+            effective += prediction.effective_draws
+            density[rows] = logsumexp(each, axis=0) - math.log(len(each))
+            # how much each draw adds to the elpd, to first order
+            error = float(np.std(np.sum(np.exp(each - density[rows]), axis=(1, 2))) / math.sqrt(effective))
+        errors[number], converged = error, converged and rest.converged
     progress("cross-validation", len(groups), len(groups), "")
     return CrossValidation(tuple(groups), tuple(groups.values()), density, converged, errors)
-
-
-def _predictive_density(
-    rest: Fit,
-    data: Measurements,
-    rows: NDArray[np.int64],
-    draws: int,
-    seed: int,
-    options: ComparisonOptions,
-    proposal: Density | None,
-) -> tuple[Floats, float]:
-    """Log predictive density of these rows of the data by a fit of the rest, and the standard error of its sum."""
-    each, effective, error = np.empty((0, *data.values[rows].shape)), 0.0, math.inf
-    while not len(each) or (error > options.monte_carlo_error and len(each) < options.most_draws):
-        prediction = posterior_predictive(rest, data, draws=draws, seed=seed + len(each), proposal=proposal)
-        each = np.concatenate([each, prediction.log_densities(data.values)[:, rows]])
-        effective += prediction.effective_draws
-        density = logsumexp(each, axis=0) - math.log(len(each))
-        # how much each draw adds to the elpd, to first order
-        error = float(np.std(np.sum(np.exp(each - density), axis=(1, 2))) / math.sqrt(effective))
-    return density, error
 
 
 def require_groups(fit: Fit, options: ComparisonOptions | None = None) -> dict[str, NDArray[np.int64]]:
@@ -136,20 +118,16 @@ def require_groups(fit: Fit, options: ComparisonOptions | None = None) -> dict[s
     fit.require_posterior("cross_validate")
     if fit.problem.problems.get("") is not fit.problem:
         raise ValueError("cross_validate: it takes a fit of one measurement by itself, not a joint one")
-    groups = groups_of(fit.problem.data.used(), options or DEFAULT)
+    data, options = fit.problem.data.used(), options or DEFAULT
+    by_incidence = incidences(data)
+    groups = {one.label: one.rows for one in by_incidence}
+    if len(by_incidence) < options.min_incidences:
+        parts = [np.array_split(rows, options.scan_parts) for rows in scans(data)]
+        together = [np.concatenate(same) for same in zip(*parts, strict=True)]
+        groups = {f"part {number} of each scan": rows for number, rows in enumerate(together, 1) if rows.size}
     if len(groups) < 2:
         raise ValueError("cross_validate: there is one incidence, and too few measurements to hold some of them out")
     return groups
-
-
-def groups_of(data: Measurements, options: ComparisonOptions) -> dict[str, NDArray[np.int64]]:
-    """Rows that are held out together, by name."""
-    by_incidence = incidences(data)
-    if len(by_incidence) >= options.min_incidences:
-        return {one.label: one.rows for one in by_incidence}
-    parts = [np.array_split(rows, options.scan_parts) for rows in scans(data)]
-    together = [np.concatenate(same) for same in zip(*parts, strict=True)]
-    return {f"part {number} of each scan": rows for number, rows in enumerate(together, 1) if rows.size}
 
 
 def without(problem: Problem, held_out: ArrayLike) -> Problem:
@@ -176,15 +154,14 @@ class ModelScore:
 
     elpd: sum of log predictive densities of measurements, each by a fit without its incidence. elpd_diff: how far it is
     below the best; dse: standard error of the difference, by the incidences and by the draws of the posterior.
-    least_diff: the difference a measurement, of the incidence where that is least. clear_diff: the difference less its
-    error (see `ComparisonOptions`). weight: of stacking (Yao, Vehtari, Simpson & Gelman 2018, Bayesian Anal. 13, 917).
+    clear_diff: the difference less its error, or all of it where every group of held-out data decides (see
+    `ComparisonOptions`). weight: of stacking (Yao, Vehtari, Simpson & Gelman 2018, Bayesian Anal. 13, 917).
     model_probability: of this stack among those compared, equally probable a priori.
     """
 
     elpd: float
     elpd_diff: float
     dse: float
-    least_diff: float
     clear_diff: float
     weight: float
     evidence: Evidence
@@ -213,7 +190,7 @@ def out_of_sample(
     require_groups(fit, options)
     draws = posterior_draws(fit)
     held_out = cross_validate(fit, options=options, progress=progress, posterior=draws)
-    return held_out, evidence_of(draws)
+    return held_out, draws.evidence
 
 
 def rank_models(
@@ -231,13 +208,12 @@ def rank_models(
         gaps = best.elpd_by_group - one.elpd_by_group
         elpd_diff, dse = float(gaps.sum()), float(np.sqrt(gaps.size) * gaps.std(ddof=1))
         dse = math.hypot(dse, 0.0 if one is best else math.hypot(one.error, best.error))
-        least_diff = float(np.min(gaps / [best.log_density[rows].size for rows in best.rows]))
-        decisive = least_diff > options.decisive_per_measurement
+        sizes = [best.log_density[rows].size for rows in best.rows]
+        decisive = bool(np.all(gaps / sizes > options.decisive_per_measurement))
         scores[name] = ModelScore(
             elpd=one.elpd,
             elpd_diff=elpd_diff,
             dse=dse,
-            least_diff=least_diff,
             clear_diff=elpd_diff if decisive else elpd_diff - options.standard_errors * dse,
             weight=float(weight),
             evidence=evidences[name],

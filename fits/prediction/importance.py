@@ -4,8 +4,7 @@ Proposals are Laplace's approximations about the minima of the fit, and where th
 ridges. The Pareto k of the largest weights says how well the draws represent the posterior (Vehtari, Simpson, Gelman,
 Yao & Gabry 2024, JMLR 25, 72). While weights are too uneven, a mixture is fitted to the weighted draws, and drawn from
 as well (Cappe, Guillin, Marin & Robert 2004, J. Comput. Graph. Stat. 13, 907); the draws of all proposals are weighted
-as those of their mixture (Cornuet, Marin, Mira & Robert 2012, Scand. J. Stat. 39, 798). Their mean weight is the
-evidence, for any proposal.
+as those of their mixture (Cornuet, Marin, Mira & Robert 2012, Scand. J. Stat. 39, 798). Their mean is the evidence.
 """
 
 from dataclasses import dataclass
@@ -30,6 +29,21 @@ DRAWS = 1000  # draws of each proposal for an evidence
 BATCH = 50  # draws that a core evaluates at a time: however many there are, one program serves
 
 
+@dataclass(frozen=True)
+class Evidence:
+    """log_evidence: natural logarithm, with data in 1/sr. error: its standard error. pareto_k: of the importance
+    weights: above 0.7 the approximation misses a part of the posterior, and the error is too small."""
+
+    log_evidence: float
+    error: float
+    pareto_k: float
+
+    @property
+    def reliable(self) -> bool:
+        """Whether the error can be trusted."""
+        return self.pareto_k < MAX_PARETO_K
+
+
 @dataclass(frozen=True, eq=False)
 class ImportanceDraws:
     """Unconstrained draws, (D, P), log weights posterior / proposal, (D,), and the Pareto k of the weights."""
@@ -44,13 +58,21 @@ class ImportanceDraws:
         total = logsumexp(self.log_weights)
         return float(np.exp(-logsumexp(2.0 * (self.log_weights - total)))) if np.isfinite(total) else 0.0
 
+    @property
+    def evidence(self) -> Evidence:
+        """The mean weight, if these are draws of the whole posterior."""
+        total, count = float(logsumexp(self.log_weights)), len(self.log_weights)
+        if not np.isfinite(total):
+            return Evidence(-np.inf, np.inf, np.inf)
+        relative = np.exp(self.log_weights - total) * count
+        return Evidence(total - float(np.log(count)), float(np.std(relative) / np.sqrt(count)), self.pareto_k)
+
     def suffices(self, max_pareto_k: float) -> bool:
         """Whether there are enough effective draws, with a Pareto k below this."""
         return self.pareto_k < max_pareto_k and self.effective_sample_size >= MIN_EFFECTIVE_DRAWS
 
     def resample(self, generator: np.random.RandomState, count: int) -> Floats:
-        """(count, P) draws of the posterior, unconstrained. Unreliable weights are tempered: draws then spread more
-        widely than the posterior, rather than repeat a few."""
+        """(count, P) draws of the posterior, unconstrained, by tempered weights where these are unreliable."""
         weights = self.log_weights if self.pareto_k < MAX_PARETO_K else _tempered(self.log_weights)
         return self.positions[_resample(weights, generator, count)]
 
@@ -137,24 +159,6 @@ def _tempered(log_weights: Floats) -> Floats:
     return scaled
 
 
-# ---- evidence ----
-
-
-@dataclass(frozen=True)
-class Evidence:
-    """log_evidence: natural logarithm, with data in 1/sr. error: its standard error. pareto_k: of the importance
-    weights: above 0.7 the approximation misses a part of the posterior, and the error is too small."""
-
-    log_evidence: float
-    error: float
-    pareto_k: float
-
-    @property
-    def reliable(self) -> bool:
-        """Whether the error can be trusted."""
-        return self.pareto_k < MAX_PARETO_K
-
-
 @broadcasting
 def evidence(fit: Fit, *, draws: int = DRAWS, seed: int = 0) -> Evidence:
     """The marginal likelihood of a fitted stack, under the priors of its parameters within their bounds.
@@ -173,19 +177,9 @@ def evidence(fit: Fit, *, draws: int = DRAWS, seed: int = 0) -> Evidence:
     require_count("draws", draws, 2)
     require_seed(seed)
     fit.require_posterior("evidence")
-    return evidence_of(posterior_draws(fit, draws, seed))
+    return posterior_draws(fit, draws, seed).evidence
 
 
 def posterior_draws(fit: Fit, draws: int = DRAWS, seed: int = 0) -> ImportanceDraws:
     """Weighted draws of a fit's posterior, of which the evidence is the mean weight."""
     return importance_draws(fit, draws, np.random.RandomState(seed), along_ridge=True)
-
-
-def evidence_of(draws: ImportanceDraws) -> Evidence:
-    """The evidence by weighted draws of the whole posterior."""
-    total = float(logsumexp(draws.log_weights))
-    if not np.isfinite(total):
-        return Evidence(-np.inf, np.inf, np.inf)
-    count = len(draws.log_weights)
-    relative = np.exp(draws.log_weights - total) * count
-    return Evidence(total - float(np.log(count)), float(np.std(relative) / np.sqrt(count)), draws.pareto_k)

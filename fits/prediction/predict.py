@@ -20,7 +20,7 @@ from scipy import stats
 from scipy.special import logsumexp
 
 from fits.data.geometry import Floats, Geometry
-from fits.data.measurements import TO_HAVE_THEM, Measurements, Source
+from fits.data.measurements import TO_HAVE_THEM, Measurements
 from fits.data.totals import Totals
 from fits.optimise.result import Fit
 from fits.prediction.importance import MAX_PARETO_K, importance_draws
@@ -63,14 +63,12 @@ class Prediction:
         wi, wo: directions, (M, 3).
         channels: C names.
         values: the stack's own value for each of D draws of the posterior, (D, M, C), in 1/sr.
-        means, scales: location and scale of a measurement for each draw, (D, M, C), in 1/sr; with a discrepancy, of its
-            `logarithm`.
+        means, scales: of a measurement for each draw, (D, M, C), in 1/sr; with a discrepancy, of its `logarithm`.
         softness: of that logarithm, (M, C) or (D, M, C), in 1/sr; None where values themselves are meant.
         discrepancy_sd: standard deviation of the discrepancy about `means`, (D, M, C), of the logarithm; None without.
         degrees_of_freedom: of Student's t; infinite for a Gaussian.
         seed: of the draws that `bsdf` and `predictive` summarise.
-        pareto_k: Pareto k of the importance weights that the draws of a fit's posterior are resampled by (see
-            `fits.evidence`); NaN for draws of a chain.
+        pareto_k: of the importance weights that draws are resampled by (see `fits.evidence`); NaN for a chain.
         effective_draws: effective sample size of the D draws of the posterior.
         measurements: the measurements that were predicted; None for a `Geometry`.
     """
@@ -250,10 +248,8 @@ def predict(
     """Predict the BSDF along other directions, and new measurements of it.
 
     Args:
-        fitted: a posterior; or a fit, whose posterior is sampled by importance (see `fits.evidence`), of a part of a
-            joint fit by its normal approximation; or an average.
-        at: pairs of directions in the upper hemisphere, or the lower one of a stack without a base; of `Measurements`
-            their used samples, with their own sigma.
+        fitted: a posterior, an average, or a fit: by importance (see `fits.evidence`), a joint one's part as normal.
+        at: pairs of directions, above a stack with a base; of `Measurements` the used samples, with their own sigma.
         draws: draws of the posterior, at least 2.
         seed: random seed of draws and noise.
 
@@ -281,11 +277,51 @@ def posterior_predictive(
     fit.require_one("predict")
     if not fit.is_posterior:
         raise ValueError(f"predict: a fit of {fit.problem.objective!r} has no noise model and predicts no measurements")
-    data, channels, noise = _measurements(fit, at), fit.problem.data.channels, fit.problem.noise
-    vectors, pareto_k, effective = _posterior_draws(fitted, draws, np.random.default_rng(seed), proposal)
-    values = np.asarray(fit.problem.predict_at(vectors, data.wi, data.wo), float)
-    values = np.broadcast_to(values, (*values.shape[:2], len(channels)))
-    means, scales, softness, discrepancy_sd = _mixture(fit, vectors, values, data)
+    problem, channels, noise = fit.problem, fit.problem.data.channels, fit.problem.noise
+    if isinstance(problem.data, Totals) or isinstance(at, Totals):
+        raise ValueError("predict: Totals are not predicted; it takes a fit of BSDF values, and directions")
+    if isinstance(at, Measurements):
+        data = at.used()
+        if len(at.channels) != len(channels):
+            own, theirs = ", ".join(channels), ", ".join(at.channels)
+            raise ValueError(f"predict: the measurements have the channels {theirs}, the fit {own}")
+    else:
+        require_visible("predict", problem.stack, light=at.wi, viewer=at.wo)
+        values = np.zeros((len(at), len(channels)))  # of what refuses bad directions
+        data = Measurements(at.wi, at.wo, values, None, np.ones(len(at), bool), channels)
+
+    # draws of the posterior, (D, P), the Pareto k of their weights, and their effective sample size
+    generator, pareto_k, effective = np.random.default_rng(seed), math.nan, float(draws)
+    if isinstance(fitted, Posterior):
+        vectors = generator.choice(fitted.samples, draws, axis=0, replace=len(fitted.samples) < draws)
+        effective = _resampled_size(draws, float(np.min(fitted.effective_samples)))
+    else:
+        random = np.random.RandomState(generator.integers(2**31))
+        if fit.dataset is not None:  # the other data sets of a joint fit constrain it as well: in its covariance
+            positions = normal_draws(fit, draws, random)
+        else:
+            pool = max(MIN_PROPOSALS, 2 * draws)
+            weighted = importance_draws(fit, pool, random, max_pareto_k=MAX_PARETO_K, proposal=proposal)
+            positions, pareto_k = weighted.resample(random, draws), weighted.pareto_k
+            effective = _resampled_size(draws, weighted.effective_sample_size)
+        vectors = np.asarray(jax.vmap(problem.model.box.constrain)(jnp.asarray(positions)), float)
+
+    # what the stack has there, the discrepancy, and noise
+    values = np.asarray(problem.predict_at(vectors, data.wi, data.wo), float)
+    means = values = np.broadcast_to(values, (*values.shape[:2], len(channels)))
+    softness, discrepancy_sd, sigma = None, None, _stated_sigma(fit, values, data.sigma)
+    relative, floor = (np.asarray(part, float)[:, None, None] for part in problem.call(_noise_levels, vectors))
+    relative = np.hypot(relative, gain_unknown(problem.instrument, data.wi, polar_angles(problem.data)))
+    if problem.model.process is None:
+        scales = np.sqrt(sigma**2 + (relative * values) ** 2 + floor**2)
+    else:
+        conditional = problem.call(_discrepancy_at, vectors, places(data.wi, data.wo))
+        discrepancy, discrepancy_sd = (np.asarray(part) for part in conditional)
+        softness = _softness(fit, np.hypot(sigma, np.median(floor)))
+        means = np.asarray(logarithm(values, softness)) + discrepancy
+        bsdf = softness * np.sinh(means)
+        spread = np.sqrt(sigma**2 + (relative * bsdf) ** 2 + floor**2) / np.asarray(size(bsdf, softness))
+        scales = np.hypot(discrepancy_sd, spread)
     return Prediction(
         wi=data.wi,
         wo=data.wo,
@@ -299,65 +335,13 @@ def posterior_predictive(
         seed=seed,
         pareto_k=pareto_k,
         effective_draws=effective,
-        measurements=at.used() if isinstance(at, Measurements) else None,
+        measurements=data if isinstance(at, Measurements) else None,
     )
-
-
-def _measurements(fit: Fit, at: Geometry | Measurements) -> Measurements:
-    if isinstance(fit.problem.data, Totals) or isinstance(at, Totals):
-        raise ValueError("predict: Totals are not predicted; it takes a fit of BSDF values, and directions")
-    channels = fit.problem.data.channels
-    if isinstance(at, Measurements):
-        if len(at.channels) != len(channels):
-            own, theirs = ", ".join(channels), ", ".join(at.channels)
-            raise ValueError(f"predict: the measurements have the channels {theirs}, the fit {own}")
-        return at.used()
-    require_visible("predict", fit.problem.stack, light=at.wi, viewer=at.wo)
-    values = np.zeros((len(at), len(channels)))
-    return Measurements(at.wi, at.wo, values, None, np.ones(len(at), bool), channels, Source("", "memory"))
-
-
-def _posterior_draws(
-    fitted: Fit | Posterior, draws: int, generator: np.random.Generator, proposal: Density | None = None
-) -> tuple[Floats, float, float]:
-    """Draws (D, P) of the posterior, the Pareto k of their weights, and their effective sample size."""
-    if isinstance(fitted, Posterior):
-        vectors = generator.choice(fitted.samples, draws, axis=0, replace=len(fitted.samples) < draws)
-        return vectors, math.nan, _resampled_size(draws, float(np.min(fitted.effective_samples)))
-    random, pareto_k, effective = np.random.RandomState(generator.integers(2**31)), math.nan, float(draws)
-    if fitted.dataset is not None:  # the other data sets of a joint fit constrain it as well: in its covariance
-        positions = normal_draws(fitted, draws, random)
-    else:
-        weighted = importance_draws(
-            fitted, max(MIN_PROPOSALS, 2 * draws), random, max_pareto_k=MAX_PARETO_K, proposal=proposal
-        )
-        positions, pareto_k = weighted.resample(random, draws), weighted.pareto_k
-        effective = _resampled_size(draws, weighted.effective_sample_size)
-    return np.asarray(jax.vmap(fitted.problem.model.box.constrain)(jnp.asarray(positions)), float), pareto_k, effective
 
 
 def _resampled_size(draws: int, pool: float) -> float:
     """Effective sample size of so many draws that are taken of a pool of this one."""
     return 1.0 / (1.0 / draws + 1.0 / max(pool, 1.0))
-
-
-def _mixture(
-    fit: Fit, vectors: Floats, values: Floats, data: Measurements
-) -> tuple[Floats, Floats, Floats | None, Floats | None]:
-    """Means, scales, softness and standard deviations of the discrepancy (see `Prediction`), where draws `vectors` of
-    the posterior have these values of the stack, (D, M, C)."""
-    sigma = _stated_sigma(fit, values, data.sigma)
-    relative, floor = (np.asarray(part, float)[:, None, None] for part in fit.problem.call(_noise_levels, vectors))
-    relative = np.hypot(relative, gain_unknown(fit.problem.instrument, data.wi, polar_angles(fit.problem.data)))
-    if fit.problem.model.process is None:
-        return values, np.sqrt(sigma**2 + (relative * values) ** 2 + floor**2), None, None
-    conditional = fit.problem.call(_discrepancy_at, vectors, places(data.wi, data.wo))
-    discrepancy, discrepancy_sd = (np.asarray(part) for part in conditional)
-    softness = _softness(fit, np.hypot(sigma, np.median(floor)))
-    means = np.asarray(logarithm(values, softness)) + discrepancy
-    bsdf = softness * np.sinh(means)
-    noise = np.sqrt(sigma**2 + (relative * bsdf) ** 2 + floor**2) / np.asarray(size(bsdf, softness))
-    return means, np.hypot(discrepancy_sd, noise), softness, discrepancy_sd
 
 
 def with_discrepancy(fit: Fit, wi: Floats, wo: Floats, values: Floats) -> Floats:

@@ -12,20 +12,16 @@ functions of the half vector or in the plane of incidence of what is its own mir
 from functools import cache
 from typing import Any, NamedTuple
 
-import jax
 import numpy as np
 from numpy.typing import NDArray
 
 import layerjax as lj
 from fits.data.geometry import TANGENT_COSINE, Floats
-from fits.problem.parameters import is_free
+from fits.problem.parameters import at_start
 from layerjax.mixture import stacks_of
 
 MOST_RINGS, MOST_OF_TWO = 8, 4  # rings of a cone, and of each of two
-PER_RING, AT_NONE = (
-    0.41,
-    0.16,
-)  # radius of a disc in widths of a lobe that n rings resolve: the first times n, less that
+PER_RING, AT_NONE = 0.41, 0.16  # radius of a disc, in widths of a lobe, that n rings resolve: PER_RING n - AT_NONE
 BOTH_WIDE = 1.2  # factor by which the radius of two cones together counts more than that of one
 SHIFT = 1e-3  # relative difference between a mean over a cone and its middle that does not count
 STEEPEST, LEAST = np.radians(85.0), 1e-6  # angle of a half vector at most; squared sum of two directions at least
@@ -49,8 +45,7 @@ def ring_counts(
     In the tangent plane there is nothing to take the mean of.
 
     source, detector: full angles of the cones, degrees. stack: of free parameters the end counts at which lobes are
-    narrowest; of anything but stacks one ring is taken everywhere, or `most`. tilt: degrees by which the sample may be
-    tilted, besides. most: rings; None: as many as are ever taken.
+    narrowest; of anything but stacks one ring is taken everywhere, or `most`. tilt: of the sample, at most, in degrees.
     """
     both = source > 0.0 and detector > 0.0
     seen = np.minimum(np.abs(wi[:, 2]), np.abs(wo[:, 2])) > TANGENT_COSINE
@@ -80,13 +75,10 @@ def _narrowest(material: lj.Stack | lj.Mixture) -> tuple[float, float]:
     for stack in stacks_of(material):
         for part in (*stack.layers, stack.base):
             if isinstance(part, lj.Interface | lj.Conductor):
-                least = part.alpha.arrays()[1] if is_free(part.alpha) else np.asarray(part.alpha)
-                facets.append(float(np.min(least)))
+                facets.append(float(np.min(at_start(part.alpha, 1))))
             elif isinstance(part, lj.Medium | lj.TurbidMedium):
                 for end in (1, 2):  # at the lower bounds of what is free, and at the upper
-                    phase = jax.tree.map(
-                        lambda x, end=end: x.arrays()[end] if is_free(x) else x, part.phase, is_leaf=is_free
-                    )
+                    phase = at_start(part.phase, end)
                     upright = isinstance(phase, lj.SGGX) and phase.kind == "surface" and phase.is_upright
                     (facets if upright else others).append(float(np.min(phase.width)))
     return min(facets), min(others)

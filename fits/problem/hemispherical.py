@@ -42,29 +42,27 @@ class Totalling(eqx.Module):
     def __call__(self, stack: lj.Stack | lj.Mixture, wi: Array, wo: Array) -> Array:
         require_single(stack, "inference")
         lights = jnp.asarray(wi)[np.array(self.solved_rows)]
-        sides: dict[Kind, Array] = {}
+        shares: dict[Kind, Array] = {}
         if not {"reflectance", "transmittance"}.isdisjoint(self.kinds):
-            near, far = self._sides(stack, lights)
-            sides = {"reflectance": near, "transmittance": far}
+            if self.spheres is None:
+                near, far = _both(stack, lights, self.transport)
+            else:  # which read diffuse light as well, from either side
+                cosine, weight = gauss_legendre(DIFFUSE)
+                upper = np.stack([np.sqrt(1.0 - cosine**2), 0.0 * cosine, cosine], axis=-1)
+                near, far = _both(stack, jnp.concatenate([lights, upper, upper * (1, 1, -1)]), self.transport)
+                share = jnp.asarray(2.0 * cosine * weight)
+                above, below = slice(-2 * DIFFUSE, -DIFFUSE), slice(-DIFFUSE, None)
+                mean = [jnp.tensordot(share, part[side], 1) for part in (near, far) for side in (above, below)]
+                count = len(self.solved_rows)
+                near, far = self.spheres.measured(Shares(near[:count], far[:count], *mean))
+            shares = {"reflectance": near, "transmittance": far}
         if "unscattered" in self.kinds:
-            sides["unscattered"] = _unscattered(stack, lights, self.transport)
-        return jnp.stack([sides[kind][place] for kind, place in zip(self.kinds, self.light, strict=True)])
-
-    def _sides(self, stack: lj.Stack | lj.Mixture, lights: Array) -> tuple[Array, Array]:
-        """All that leaves on the side of each light, and on the other; as spheres read it, if there are any."""
-        if self.spheres is None:
-            return _both(stack, lights, self.transport)
-        cosine, weight = gauss_legendre(DIFFUSE)
-        upper = np.stack([np.sqrt(1.0 - cosine**2), 0.0 * cosine, cosine], axis=-1)
-        near, far = _both(stack, jnp.concatenate([lights, upper, upper * (1, 1, -1)]), self.transport)
-        share = jnp.asarray(2.0 * cosine * weight)
-        above, below = slice(-2 * DIFFUSE, -DIFFUSE), slice(-DIFFUSE, None)
-        mean = [jnp.tensordot(share, part[side], 1) for part in (near, far) for side in (above, below)]
-        count = len(self.solved_rows)
-        return self.spheres.measured(Shares(near[:count], far[:count], *mean))
+            shares["unscattered"] = _unscattered(stack, lights, self.transport)
+        return jnp.stack([shares[kind][place] for kind, place in zip(self.kinds, self.light, strict=True)])
 
 
 def _both(stack: lj.Stack | lj.Mixture, lights: Array, transport: Any) -> tuple[Array, Array]:
+    """All that leaves on the side of each light, and on the other."""
     near, far = lj.albedo(stack, lights, transport)
     return near, far + lj.unscattered(stack, lights)
 

@@ -138,13 +138,6 @@ def optics_of(
     return Optics(*arrays, known)
 
 
-def rings_for(instrument: Instrument, setting: Setting, stack: Any, wi: Floats, wo: Floats) -> int:
-    """Rings of rays of a cone that the lobes of a stack ask for, none of it `Free`, along directions (N, 3) each."""
-    tilt = 0.0 if setting.tilt is None else abs(float(setting.tilt))
-    counts = ring_counts(instrument.source_aperture, instrument.detector_aperture, stack, wi, wo, tilt)
-    return max(int(np.max(counts)), 1)
-
-
 def gain_unknown(instrument: Instrument | None, wi: Floats, incidences: Floats) -> Floats:
     """Relative standard deviation, (M, 1), of the gain of light along wi (M, 3), beside incidences that have one."""
     if instrument is None or instrument.gain_sd is None:
@@ -169,7 +162,16 @@ def _cones(
         discs = rays(int(rings), *(width > 0.0 for width in widths))
         weights, parts = discs.weights[:, None], []
         for w, width, disc in zip((wi[rows], wo[rows]), widths, discs[:2], strict=True):
-            parts.append(_over_disc(w, math.radians(0.5 * width), disc))
+            # places on the unit disc become directions (K, M, 3) of the cone about w, areas solid angles
+            square = np.sum(disc**2, axis=-1)
+            cosine = 1.0 - (1.0 - math.cos(math.radians(0.5 * width))) * square
+            sine = np.sqrt((1.0 - cosine) * (1.0 + cosine))
+            across = disc * (sine / np.where(square > 0.0, np.sqrt(square), 1.0))[:, None]
+            # unit vectors across w, along the horizon and in its plane with the normal: both turn with the azimuth
+            forward = _horizontal(w)
+            along = np.stack([-forward[:, 1], forward[:, 0], np.zeros(len(w))], axis=-1)
+            sideways = across[:, :1, None] * np.cross(along, w) + across[:, 1:, None] * along
+            parts.append(cosine[:, None, None] * w + sideways)
             # light that would come or go below the horizon is not there
             weights = weights * np.maximum(parts[-1][..., 2] * np.sign(w[:, 2]), 0.0) / np.abs(w[:, 2])
         for found, part, w in ((lights, parts[0], wi[rows]), (views, parts[1], wo[rows])):
@@ -179,30 +181,16 @@ def _cones(
     return (np.concatenate(lights), np.concatenate(views)), np.concatenate(row), np.concatenate(share)
 
 
-def _over_disc(w: Floats, radius: float, disc: Floats) -> Floats:
-    """Directions (K, M, 3) of a cone about w (M, 3), as places (K, 2) on the unit disc: areas become solid angles."""
-    square = np.sum(disc**2, axis=-1)
-    cosine = 1.0 - (1.0 - math.cos(radius)) * square
-    sine = np.sqrt((1.0 - cosine) * (1.0 + cosine))
-    across = disc * (sine / np.where(square > 0.0, np.sqrt(square), 1.0))[:, None]
-    # unit vectors across w, along the horizon and in its plane with the normal: both turn with the azimuth
-    forward = _horizontal(w)
-    along = np.stack([-forward[:, 1], forward[:, 0], np.zeros(len(w))], axis=-1)
-    return cosine[:, None, None] * w + across[:, :1, None] * np.cross(along, w) + across[:, 1:, None] * along
-
-
-def _horizontal(w: Floats) -> Floats:
-    """Unit vectors (M, 2) of azimuths; along x at the normal."""
-    length = np.hypot(w[:, 0], w[:, 1])[:, None]
+def _horizontal(w: Floats, normal: float = 0.0) -> Floats:
+    """Unit vectors (M, 2) of azimuths; normal: the azimuth at the normal, in degrees."""
+    length, turn = np.hypot(w[:, 0], w[:, 1])[:, None], math.radians(normal)
     away = length > np.sin(np.radians(AT_NORMAL))
-    return np.where(away, w[:, :2] / np.where(away, length, 1.0), [1.0, 0.0])
+    return np.where(away, w[:, :2] / np.where(away, length, 1.0), [math.cos(turn), math.sin(turn)])
 
 
 def _forward(wi: Floats) -> Floats:
     """Towards the mirror side of light along wi (M, 3), horizontal, (M, 2); at the normal light comes as files say."""
-    away = np.hypot(wi[:, 0], wi[:, 1])[:, None] > np.sin(np.radians(AT_NORMAL))
-    turn = math.radians(LIGHT_AZIMUTH)
-    return -np.where(away, _horizontal(wi), [math.cos(turn), math.sin(turn)])
+    return -_horizontal(wi, LIGHT_AZIMUTH)
 
 
 def _tilted(w: Any, forward: Any, offset: Any) -> Array:

@@ -43,8 +43,7 @@ class Noise:
     relative: a share of f, in [0, 1] (0.05 is 5 %), or `Free`.
     floor: 1/sr, 0 or in [1e-100, 1e100], or `Free` with low > 0.
     use_sigma: take the measurement's own sigma where it has one.
-    tails: "gaussian", or "student" with `degrees_of_freedom` in [0.01, 1e6], whose scale (not standard deviation) is
-    then sigma.
+    tails: "gaussian", or "student" with `degrees_of_freedom` in [0.01, 1e6], of scale (not standard deviation) sigma.
     discrepancy: model discrepancy beside that: `Discrepancy`, or True for one whose numbers are all free; only with
     Gaussian tails. False: none. None leaves it to the residuals: a stack is fitted without; where residuals of
     neighbours along a scan are correlated by more than 0.2 and 3 standard errors, it is fitted again with it, and the

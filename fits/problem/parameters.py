@@ -9,7 +9,7 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
-from typing import Any, ClassVar, cast
+from typing import Any, ClassVar, Literal, cast
 
 import equinox as eqx
 import jax
@@ -66,7 +66,6 @@ class Normal(Prior):
         require_number("Normal.sd", self.sd, 0.0, open_ends=True)
 
     def gaussian(self) -> tuple[float, float]:
-        """Centre and inverse standard deviation."""
         return float(self.mean), 1.0 / float(self.sd)
 
 
@@ -83,7 +82,6 @@ class LogNormal(Prior):
         require_number("LogNormal.sd", self.sd, 0.0, open_ends=True)
 
     def gaussian(self) -> tuple[float, float]:
-        """Centre and inverse standard deviation of the logarithm."""
         return math.log(self.median), 1.0 / float(self.sd)
 
 
@@ -233,8 +231,7 @@ class PowerLaw(Shown):
     """A number a channel, ``amplitude (wavelength / reference)^-exponent``: in the place of one in a stack.
 
     amplitude: the number at the reference, in its unit, or `Free` with low >= 0. exponent: unitless, or `Free`; of
-    reduced scattering 0.5 to 4 are common. wavelengths: one a channel, in nm. reference: in nm; the geometric mean of
-    the wavelengths by default.
+    reduced scattering 0.5 to 4 are common. wavelengths: one a channel, in nm. reference: in nm; None: geometric mean.
 
     Raises:
         ValueError: nothing is free, a number a channel, fewer than two wavelengths, or one that is not above 0.
@@ -254,11 +251,13 @@ class PowerLaw(Shown):
         given = np.asarray(wavelengths, float)
         if given.ndim != 1 or given.size < 2:
             raise ValueError(f"PowerLaw.wavelengths has shape {given.shape}; it must be one a channel, two or more")
+        for name, values in (("wavelengths", given), ("reference", 1.0 if reference is None else reference)):
+            if not np.all(np.isfinite(values) & (np.asarray(values) > 0.0)):
+                raise ValueError(
+                    f"PowerLaw.{name} is {in_short(np.asarray(values).tolist())}; it must be finite and above 0"
+                )
         self.wavelengths = tuple(given.tolist())
         self.reference = float(np.exp(np.mean(np.log(given)))) if reference is None else float(reference)
-        for name, values in (("wavelengths", given), ("reference", np.array([self.reference]))):
-            if not np.all(np.isfinite(values) & (values > 0.0)):
-                raise ValueError(f"PowerLaw.{name} is {in_short(values.tolist())}; it must be finite and above 0")
         require_number_or_free("PowerLaw.amplitude", amplitude, 0.0, math.inf)
         require_number_or_free("PowerLaw.exponent", exponent, -math.inf, math.inf)
         if not (is_free(amplitude) or is_free(exponent)):
@@ -287,10 +286,11 @@ def with_values(tree: Any) -> Any:
     return jax.tree.map(lambda leaf: leaf.values() if is_law(leaf) else leaf, tree, is_leaf=is_law)
 
 
-def at_start(tree: Any) -> Any:
-    """The tree with every free parameter at its start."""
-    start = jax.tree.map(lambda leaf: jnp.asarray(leaf.arrays()[0]) if is_free(leaf) else leaf, tree, is_leaf=is_free)
-    return with_values(start)
+def at_start(tree: Any, end: Literal[0, 1, 2] = 0) -> Any:
+    """The tree with every free parameter at its start; end: 1 at its lower bound, 2 at its upper one."""
+    return with_values(
+        jax.tree.map(lambda leaf: jnp.asarray(leaf.arrays()[end]) if is_free(leaf) else leaf, tree, is_leaf=is_free)
+    )
 
 
 def require_in_range(material: Any) -> None:

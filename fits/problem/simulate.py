@@ -5,9 +5,7 @@ import sys
 import numpy as np
 
 import layerjax as lj
-from fits.data.geometry import Floats, polar
-from fits.data.geometry import Geometry as Geometry
-from fits.data.geometry import slices as slices
+from fits.data.geometry import Floats, Geometry, polar
 from fits.data.measurements import SMALLEST_SIGMA, Measurements, Source, channel_names
 from fits.problem.model import Transport, forward
 from layerjax._checks import require_kind, require_number, require_seed
@@ -39,8 +37,7 @@ def simulate(
         stack gives 0 and `floor` is 0 carry no noise, which no measurement does: they are masked.
 
     Raises:
-        ValueError: a negative `noise` or `floor`, a light below an opaque stack, or a transport that is random or
-            cannot carry the stack.
+        ValueError: a negative `noise` or `floor`, a light below an opaque stack, or a transport that does not carry it.
     """
     require_number("noise", noise, 0.0, 1.0)
     require_number("floor", floor, 0.0, sys.float_info.max)

@@ -7,13 +7,8 @@
     thickness = { start = 0.5, low = 0.0, high = 5.0, prior = { kind = "Normal", mean = 0.5, sd = 0.2 } }
     phase = { kind = "SGGX", shape = "surface", alpha = 0.3 }
 
-    [base]
-    kind = "Lambertian"
-    albedo = [0.1, 0.2, 0.3]                   # one number, or one a channel
-
 ``docs/guides/own_data.md`` says what else may stand there. Keys are the parameters of the classes of the same name; the
-`kind` of an SGGX is called `shape` here. Bad input is a ValueError on one line that names the place (``layers[0]``) and
-the parameter.
+`kind` of an SGGX is called `shape` here. Bad input is a ValueError on one line that names place and parameter.
 """
 
 import difflib
@@ -22,6 +17,7 @@ import math
 import tomllib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields
+from numbers import Real
 from pathlib import Path
 from typing import Any, Literal, cast, get_args
 
@@ -67,7 +63,7 @@ class ProblemFile:
     stack: lj.Stack | lj.Mixture
     transport: lj.Transport | Literal["auto"]
     noise: Noise
-    scale: Free | None
+    scale: float | Free | None
     objective: Objective
     instrument: Instrument | None
     options: Mapping[str, Any]
@@ -119,7 +115,7 @@ def write_problem(
     *,
     transport: lj.Transport | Literal["auto"] = "auto",
     noise: Noise | None = None,
-    scale: Free | None = None,
+    scale: float | Free | None = None,
     objective: Objective = "likelihood",
     instrument: Instrument | None = None,
     force: bool = False,
@@ -137,8 +133,9 @@ def write_problem(
     """
     require_material(stack)
     require_kind("transport", transport, lj.Transport, str)
-    for name, value, kind in (("noise", noise, Noise), ("scale", scale, Free), ("instrument", instrument, Instrument)):
-        require_kind(name, value, kind, None)
+    require_kind("noise", noise, Noise, None)
+    require_kind("scale", scale, Real, Free, None)
+    require_kind("instrument", instrument, Instrument, None)
     choice("objective", objective, get_args(Objective))
     tables = {"transport": transport_to_dict(transport), "objective": objective}
     tables = {name: value for name, value in tables.items() if value not in ("auto", "likelihood")}
@@ -315,12 +312,6 @@ def material_to_dict(material: lj.Stack | lj.Mixture) -> dict[str, Any]:
     return tables if material.base is None else tables | {"base": _module_to_dict(material.base)}
 
 
-def _changed_to_dict(thing: Noise | Instrument | Discrepancy | Free) -> dict[str, Any]:
-    """What is not as it is by default."""
-    every = {entry.name: (getattr(thing, entry.name), entry.default) for entry in fields(thing)}
-    return {name: _to_plain(value) for name, (value, default) in every.items() if value != default}
-
-
 def transport_to_dict(transport: lj.Transport | Literal["auto"]) -> str | dict[str, Any]:
     """The inverse of `transport_from_dict`: a name where that says all."""
     if isinstance(transport, str):
@@ -339,10 +330,10 @@ def _module_to_dict(module: Any) -> dict[str, Any]:
 def _to_plain(value: Any) -> Any:
     if isinstance(value, str | bool | int):
         return value
-    if isinstance(value, Free | Noise | Instrument):
-        return _changed_to_dict(value)
-    if isinstance(value, Discrepancy):
-        return _changed_to_dict(value) or True
+    if isinstance(value, Free | Noise | Instrument | Discrepancy):  # what is not as it is by default
+        every = {entry.name: (getattr(value, entry.name), entry.default) for entry in fields(value)}
+        changed = {name: _to_plain(one) for name, (one, default) in every.items() if one != default}
+        return changed or (True if isinstance(value, Discrepancy) else {})
     if isinstance(value, lj.PhaseFunction | Prior | PowerLaw):
         return _module_to_dict(value)
     array = np.asarray(value)

@@ -1,5 +1,4 @@
-"""What is in a measurement file, before any model: tables of its content, and sentences on doubtful angles,
-reciprocity, energy and repeated measurements."""
+"""What is in a measurement file: tables, and sentences on doubtful angles, reciprocity, energy and repeats."""
 
 import math
 from typing import NamedTuple
@@ -8,14 +7,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import Delaunay, QhullError, cKDTree
 
+from fits.data.geometry import direction
 from fits.data.measurements import Measurements
 from fits.data.scans import AT_NORMAL, SAME_ANGLE, in_plane, incidences, relative_azimuth, scans, signed_angle
 from fits.data.totals import Totals
 from fits.reports.tables import Table, degrees, shortened
 
-MOST_CHANNELS, MOST_ENERGIES, MOST_ANGLES = 6, 6, 24
-"""Shown one by one: channels, incidences with an energy, and incidences in a line."""
-
+MOST_CHANNELS, MOST_ENERGIES, MOST_ANGLES = 6, 6, 24  # shown one by one: channels, energies, incidences in a line
 BRIGHTER = 1.3  # ratio of the brightest measurements of two sides above which one side is the brighter beyond noise
 SAME_PLACE = 0.05  # degrees within which two measurements are repeats of one
 LEAST_COVERED = 0.5  # share of the projected hemisphere that must be covered for an integral over it
@@ -27,14 +25,15 @@ def source_rows(data: Measurements) -> tuple[tuple[str, str], ...]:
     source, used, channels = data.source, int(np.count_nonzero(data.mask)), ", ".join(data.channels)
     if len(data.channels) > MOST_CHANNELS:
         channels = f"{', '.join(data.channels[:3])}, ..., {data.channels[-1]} ({len(data.channels):,} in all)"
+    rows = [("format", source.format)]
     if isinstance(data, Totals):
-        quantity, plane = "shares of the incident flux", []
-        if data.spheres is not None:
-            spheres = "two integrating spheres" if data.spheres.together else "an integrating sphere"
-            quantity = f"{quantity}, as measured with {spheres}"
+        spheres = "" if data.spheres is None else ", as measured with an integrating sphere"
+        if data.spheres is not None and data.spheres.together:
+            spheres = ", as measured with two integrating spheres"
+        rows.append(("quantity", f"shares of the incident flux{spheres}"))
     else:
-        quantity = f"{source.quantity}, converted to BRDF in 1/sr"
-        plane = [("in plane", f"{np.count_nonzero(in_plane(data))} of {len(data)}")]
+        rows.append(("quantity", f"{source.quantity}, converted to BRDF in 1/sr"))
+        rows.append(("in plane", f"{np.count_nonzero(in_plane(data))} of {len(data)}"))
     angles = [one.theta for one in incidences(data.used())]
     span = ", ".join(f"{angle:g}°" for angle in angles)
     if len(angles) > MOST_ANGLES:
@@ -44,17 +43,10 @@ def source_rows(data: Measurements) -> tuple[tuple[str, str], ...]:
         with np.errstate(divide="ignore", invalid="ignore"):
             relative = (data.sigma / np.abs(data.values))[data.mask]
         sigma = f"median {np.median(relative):.2%} of the value, {np.min(relative):.2%} to {np.max(relative):.2%}"
-    return (
-        ("format", source.format),
-        ("quantity", quantity),
-        ("measurements", f"{len(data)}, {used} used, {len(data) - used} masked"),
-        ("channels", channels),
-        *plane,
-        ("incidence", span),
-        ("sigma", sigma),
-        *(("attribution", word) for word in (source.attribution,) if word),
-        *(("note", note) for note in source.notes),
-    )
+    rows += [("measurements", f"{len(data)}, {used} used, {len(data) - used} masked"), ("channels", channels)]
+    rows += [("incidence", span), ("sigma", sigma)]
+    rows += [("attribution", source.attribution)] if source.attribution else []
+    return (*rows, *(("note", note) for note in source.notes))
 
 
 def data_table(data: Measurements) -> Table:
@@ -85,15 +77,16 @@ def doubtful_angles(data: Measurements) -> list[str]:
     largest = np.max(data.theta_i if total else np.concatenate([data.theta_i, data.theta_o]), initial=0.0)
     if 0.0 < largest < 1.6:  # a little more than a right angle in radians
         words.append(f"Angles: none is above {largest:.4g}°: are they radians? They were read as degrees.")
-    if total or not (seen := sides(data)):
+    if total or not len(found := sides(data)):
         return words
-    brighter = [one for one in seen if one.light > BRIGHTER * max(one.mirror, 0.0)]
-    if all(math.isnan(one.mirror) for one in seen):
+    theta, light, mirror = found.T
+    brighter, darker = light > BRIGHTER * np.maximum(mirror, 0.0), mirror > BRIGHTER * np.maximum(light, 0.0)
+    if np.isnan(mirror).all():
         where = "all measurements in the plane of incidence lie on the light's side"
-    elif len(brighter) > sum(one.mirror > BRIGHTER * max(one.light, 0.0) for one in seen):
-        worst = max(brighter, key=lambda one: one.light)
-        where = f"the brightest side is the light's: at {worst.theta:g}° up to {worst.light:.3g} there"
-        where = f"{where}, and {worst.mirror:.3g} on the mirror side"
+    elif np.count_nonzero(brighter) > np.count_nonzero(darker):
+        worst = np.argmax(np.where(brighter, light, -np.inf))
+        where = f"the brightest side is the light's: at {theta[worst]:g}° up to {light[worst]:.3g} there"
+        where = f"{where}, and {mirror[worst]:.3g} on the mirror side"
     else:
         return words
     return [
@@ -121,8 +114,9 @@ def data_statements(data: Measurements) -> list[str]:
         energy = f"directional albedo over the measured part of the projected hemisphere: {'; '.join(parts)}"
     if above := [f"{one.theta:g}°" for one in known if max(one.share) > 1.0]:
         energy = f"{energy}. It exceeds 1 at {', '.join(above)}: the scale is wrong"
-    repeated = repeats(data)
-    noise = "" if repeated is None else f", a noise of about {100.0 * repeated.noise:.2g} %"
+    repeated, noise = repeats(data), ""
+    if repeated is not None:  # the median of the difference of two Gaussian numbers is 0.6745 sqrt(2) sd
+        noise = f", a noise of about {100.0 * repeated.median / (0.6745 * math.sqrt(2.0)):.2g} %"
     return [
         *doubtful_angles(data),
         f"Reciprocity: {agreement('with light and viewer exchanged', reciprocity(data))}.",
@@ -141,11 +135,6 @@ class Agreement(NamedTuple):
     median: float
     p95: float
 
-    @property
-    def noise(self) -> float:
-        """Relative standard deviation of a single measurement, for random Gaussian differences."""
-        return self.median / (0.6745 * 2.0**0.5)
-
 
 class Energy(NamedTuple):
     """Share (C,) of light at polar angle `theta` that is reflected into the `covered` share of the hemisphere."""
@@ -155,33 +144,21 @@ class Energy(NamedTuple):
     covered: float
 
 
-class Sides(NamedTuple):
-    """Brightest measurements in the plane of incidence on the sides of light and mirror; NaN if that was not seen."""
-
-    theta: float
-    light: float
-    mirror: float
-
-
 def reciprocity(data: Measurements) -> Agreement | None:
-    """Pairs in which light and viewer change places, both above the surface; None if there is none.
-
-    If all measurements lie on one side of the plane of incidence, the sample is taken to be symmetric about it.
-    """
+    """Pairs in which light and viewer change places; None without any. Data of one side of the plane are mirrored."""
     used = _above(data)
     if not len(used):
         return None
-    azimuth = np.radians(relative_azimuth(used))
-    side = np.where(np.abs(np.sin(azimuth)) > np.sin(np.radians(SAME_ANGLE)), np.sin(azimuth), 0.0)
+    azimuth = np.where(np.minimum(used.theta_i, used.theta_o) < AT_NORMAL, 0.0, relative_azimuth(used))
+    side = np.where(np.abs(np.sin(np.radians(azimuth))) > np.sin(np.radians(SAME_ANGLE)), azimuth, 0.0)
     both = side.min() < 0.0 < side.max()
     azimuth = azimuth if both else np.abs(azimuth)
-    # polar angles, and the azimuth between them as a point of a circle: at the normal there is none
-    size = np.where(np.minimum(used.theta_i, used.theta_o) < AT_NORMAL, 0.0, np.degrees(1.0))
-    circle = size * np.cos(azimuth), size * np.sin(azimuth)
-    places = np.column_stack([used.theta_i, used.theta_o, *circle])
-    exchanged = np.column_stack([used.theta_o, used.theta_i, circle[0], -circle[1] if both else circle[1]])
+    # the light's polar angle, and the viewer where the light stands at one azimuth
+    places = np.column_stack([used.theta_i, np.degrees(direction(used.theta_o, azimuth))])
+    exchanged = np.degrees(direction(used.theta_i, -azimuth if both else azimuth))
     rows = np.flatnonzero(np.abs(used.theta_i - used.theta_o) > SAME_ANGLE)
-    distance, nearest = cKDTree(places).query(exchanged[rows], distance_upper_bound=SAME_ANGLE)
+    tree, exchanged = cKDTree(places), np.column_stack([used.theta_o, exchanged])[rows]
+    distance, nearest = tree.query(exchanged, distance_upper_bound=SAME_ANGLE)
     found = np.isfinite(distance)
     pairs = np.unique(np.sort(np.column_stack([rows[found], nearest[found]]), axis=1), axis=0)
     return _agreement(used, *pairs[pairs[:, 0] != pairs[:, 1]].T)
@@ -197,8 +174,7 @@ def repeats(data: Measurements) -> Agreement | None:
 
 
 def energies(data: Measurements) -> list[Energy]:
-    """Energy of each incidence whose measurements cover at least half of the projected hemisphere; measurements on one
-    side of the plane of incidence are mirrored."""
+    """Energy of each incidence that is measured over half of the projected hemisphere; of one side, mirrored."""
     used, result = _above(data), []
     for one in incidences(used):
         azimuth = np.radians(relative_azimuth(used)[one.rows])
@@ -221,24 +197,20 @@ def energies(data: Measurements) -> list[Energy]:
     return result
 
 
-def sides(data: Measurements) -> list[Sides]:
-    """Brightest measurements of each scan in the plane of incidence, over the angles that both sides cover."""
-    used = _above(data)
-    angle, coplanar, result = signed_angle(used), in_plane(used), []
-    for rows in scans(used):
-        rows = rows[coplanar[rows]]
-        if not rows.size or used.theta_i[rows[0]] < STEEP:
+def sides(data: Measurements) -> NDArray[np.float64]:
+    """Incidence, and the brightest on the sides of light and mirror (NaN: not measured) of each scan, (K, 3)."""
+    used, result = _above(data), []
+    angle, coplanar = signed_angle(used), in_plane(used)
+    for rows in (rows[coplanar[rows]] for rows in scans(used)):
+        if not rows.size or used.theta_i[rows[0]] < STEEP or angle[rows].min() >= -SAME_ANGLE:
             continue
         theta, level = angle[rows], used.values[rows].mean(axis=1)
-        if theta.min() >= -SAME_ANGLE:
-            continue
         one_sided = theta.max() <= SAME_ANGLE
         limit = np.inf if one_sided else min(theta.max(), -theta.min()) + SAME_ANGLE
         light, mirror = (level[(sign * theta > SAME_ANGLE) & (sign * theta <= limit)] for sign in (-1, 1))
         if light.size and (mirror.size or one_sided):
-            brightest = np.nan if one_sided else float(mirror.max())
-            result.append(Sides(float(used.theta_i[rows[0]]), float(light.max()), brightest))
-    return result
+            result.append((used.theta_i[rows[0]], light.max(), np.nan if one_sided else mirror.max()))
+    return np.array(result).reshape(-1, 3)
 
 
 def _above(data: Measurements) -> Measurements:

@@ -4,7 +4,12 @@ import base64
 import html
 from collections.abc import Sequence
 from dataclasses import dataclass
+from importlib import metadata
 from string import Template
+
+import layerjax
+
+PACKAGES = ("jax", "equinox", "optimistix", "emcee", "numpy", "scipy")
 
 
 @dataclass(frozen=True)
@@ -51,10 +56,13 @@ def document(title: str, body: Sequence[str]) -> str:
     return _PAGE.substitute(title=html.escape(title), body="\n".join(body))
 
 
+def versions() -> dict[str, str]:
+    """Versions of the packages that a result depends on."""
+    return {"layerjax": layerjax.__version__} | {package: metadata.version(package) for package in PACKAGES}
+
+
 def made_with() -> str:
     """Versions of what a page was made with, as an HTML fragment."""
-    from fits.reports.results import versions
-
     words = [f"{package} {version}" for package, version in versions().items()]
     return f'<p class="note">Made with {html.escape(", ".join(words))}.</p>'
 

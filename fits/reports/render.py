@@ -19,22 +19,16 @@ from layerjax.mixture import require_material, stacks_of
 
 Prepared = lj.Prepared | lj.Mixture
 
-
+# towards the light: x to the right, y up, z towards the viewer
 LIGHTS = {
     "lit from the front": (-0.4, 0.5, 0.77),
     "from the side": (-0.85, 0.35, 0.1),
     "from behind": (0.5, 0.45, -0.74),
 }
-"""Towards the light: x to the right, y up, z towards the viewer."""
-
-SUN, SKY = 0.8, 0.2
-"""What a white diffuse surface shows of the light at normal incidence, and of the sky, which is all around."""
-
-SAMPLES, SKY_COSINES, SKY_AZIMUTHS = 2, 24, 24
-"""Points along each side of a pixel, and directions at which the reflected sky is tabulated."""
-
-INCIDENT, OUTGOING = np.linspace(0.0, 90.0, 91), np.linspace(-90.0, 90.0, 181)
-"""Edges of the cells of the map of the BSDF, degrees."""
+SUN, SKY = 0.8, 0.2  # what a white diffuse surface shows of the light at normal incidence, and of the sky all around
+SAMPLES = 2  # points along each side of a pixel
+SKY_COSINES, SKY_AZIMUTHS = 24, 24  # directions at which the reflected sky is tabulated
+INCIDENT, OUTGOING = np.linspace(0.0, 90.0, 91), np.linspace(-90.0, 90.0, 181)  # edges of cells of the BSDF's map
 
 
 def render(
@@ -56,8 +50,7 @@ def render(
         size: pixels of a sphere's diameter, in [16, 1024].
 
     Raises:
-        ValueError: the size is out of range, the stack ends in another index than that of air, or the transport is
-            random or does not carry the stack.
+        ValueError: a size out of range, a stack that ends in another index than air, or a transport that is random.
     """
     require_material(stack)
     if not (isinstance(size, int) and 16 <= size <= 1024):  # more take several GB, and the picture has no more across
@@ -65,16 +58,14 @@ def render(
     for part in stacks_of(stack):
         indices = [float(layer.ior) for layer in part.layers if isinstance(layer, lj.Interface)]
         if part.base is None and indices and indices[-1] != 1.0:
-            raise ValueError(
-                f"layers: the stack ends in a medium of index {indices[-1]:g}, and the picture is of a sheet in air: "
-                "close it with an Interface of ior 1, or give it a base"
-            )
+            words = "the picture is of a sheet in air: close it with an Interface of ior 1, or give it a base"
+            raise ValueError(f"layers: the stack ends in a medium of index {indices[-1]:g}, and {words}")
     chosen = lj.AddingDoubling() if transport is None else transport
     if isinstance(chosen, lj.Transport) and chosen.random:
         raise ValueError(f"transport: {type(chosen).__name__} is random; use a deterministic one: AddingDoubling()")
     prepared = lj.prepare(stack, chosen)
-    maps = _maps(prepared, any(part.base is None for part in stacks_of(stack)))
-    lights = [name for name in LIGHTS if "transmitted" in maps or name != "from behind"]
+    transmits = any(part.base is None for part in stacks_of(stack))
+    lights = [name for name in LIGHTS if transmits or name != "from behind"]
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(10.5, 7.2), layout="constrained")
         if title:
@@ -85,21 +76,15 @@ def render(
             axes.set_title(name)
             axes.set_axis_off()
         left, right = np.ravel(below.subfigures(1, 2, width_ratios=(1.0, 1.25), squeeze=False))
-        _lobes(left.subplots(subplot_kw={"projection": "polar"}), prepared, "transmitted" in maps)
-        _draw_maps(right, maps)
+        _lobes(left.subplots(subplot_kw={"projection": "polar"}), prepared, transmits)
+        _maps(right, prepared, transmits)
     return figure
 
 
 def sphere(stack: lj.Stack | lj.Mixture, prepared: Prepared, light: tuple[float, float, float], size: int) -> Floats:
-    """Radiance of the pixels, (size, size, 3), linear.
+    """Radiance of the pixels of a sphere, (size, size, 3), linear, each the mean of `SAMPLES` by `SAMPLES` points.
 
-    An irradiance of pi `SUN` across the light, a sky of radiance `SKY`, a viewer far away, and a picture 1.04 times as
-    wide as the sphere.
-
-    Args:
-        stack, prepared: the material, and what `layerjax.prepare` made of it.
-        light: towards it, of any length: x to the right, y up, z towards the viewer.
-        size: pixels along each side, each the mean of `SAMPLES` by `SAMPLES` points.
+    An irradiance of pi `SUN` across the light (see `LIGHTS`), a sky of radiance `SKY`, and a viewer far away.
     """
     number = SAMPLES * size
     place = ((np.arange(number) + 0.5) / number * 2.0 - 1.0) * 1.04
@@ -146,34 +131,27 @@ def _lobes(axes: Axes, prepared: Prepared, transmits: bool) -> None:
         wi = lj.direction(-np.radians(incidence), 0.0)
         value = np.asarray(lj.evaluate(prepared, wi, wo) * jnp.abs(wo[:, 2:])).mean(axis=-1)
         axes.plot(angle, np.sqrt(value), color=colour, label=f"{incidence:.0f}°")
-    axes.set_theta_zero_location("N")  # type: ignore[attr-defined]
-    axes.set_theta_direction(-1)  # type: ignore[attr-defined]
-    if not transmits:
-        axes.set_thetamin(-90)  # type: ignore[attr-defined]
-        axes.set_thetamax(90)  # type: ignore[attr-defined]
+    axes.set(theta_zero_location="N", theta_direction=-1, **({} if transmits else {"thetamin": -90, "thetamax": 90}))
     axes.yaxis.set_major_locator(MaxNLocator(4))
     axes.set_title("√(f |cos θₒ|), 1/√sr, in the plane of incidence", pad=14)
     axes.legend(title="incidence", loc="lower left", bbox_to_anchor=(-0.3, -0.05))
 
 
-def _maps(prepared: Prepared, open_below: bool) -> dict[str, Floats]:
-    """The BSDF in the plane of incidence, (incident, outgoing) angles, of each side to which any light goes."""
+def _maps(figure: SubFigure, prepared: Prepared, transmits: bool) -> None:
+    """The BSDF by incident and outgoing angle in the plane of incidence, a map for each side to which light goes.
+
+    Colours are of the values below 75 degrees, four decades at most.
+    """
     incident, outgoing = (np.radians(0.5 * (edges[1:] + edges[:-1])) for edges in (INCIDENT, OUTGOING))
-    wi, sides = lj.direction(-incident, 0.0)[:, None], {"reflected": lj.direction(outgoing, 0.0)}
-    if open_below:
-        sides["transmitted"] = lj.direction(np.pi - outgoing, 0.0)
-    maps = {name: np.asarray(lj.evaluate(prepared, wi, wo)).mean(axis=-1) for name, wo in sides.items()}
-    return {name: values for name, values in maps.items() if name == "reflected" or np.any(values > 0)}
-
-
-def _draw_maps(figure: SubFigure, maps: dict[str, Floats]) -> None:
-    """Incident by outgoing angle, one map for each side; colours over the values off grazing, four decades at most."""
-    inner = [values[:75, 15:-15] for values in maps.values()]  # below 75 degrees
+    below = np.where(outgoing > 0.0, np.pi, -np.pi) - outgoing
+    sides = {"reflected": outgoing} | ({"transmitted": below} if transmits else {})
+    wi, panels = lj.direction(-incident, 0.0)[:, None], figure.subplots(len(sides), 1, sharex=True, squeeze=False)[:, 0]
+    maps = [np.asarray(lj.evaluate(prepared, wi, lj.direction(side, 0.0))).mean(axis=-1) for side in sides.values()]
+    inner = [values[:75, 15:-15] for values in maps]
     largest = max(float(values.max()) for values in inner) or 1.0
     least = max(min(float(values.min()) for values in inner), 1e-4 * largest)
     norm = LogNorm(min(least, 0.5 * largest), largest)
-    panels = figure.subplots(len(maps), 1, sharex=True, squeeze=False)[:, 0]
-    for axes, (name, values) in zip(panels, maps.items(), strict=True):
+    for axes, name, values in zip(panels, sides, maps, strict=True):
         within = np.clip(values, norm.vmin, norm.vmax)
         image = axes.pcolormesh(OUTGOING, INCIDENT, within, norm=norm, cmap="viridis", rasterized=True)
         axes.set(ylabel="incidence, degrees", title=f"BSDF in the plane of incidence, {name}")

@@ -11,45 +11,38 @@ report.html    the report, pictures inside
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, fields, is_dataclass, replace
-from importlib import metadata
+from dataclasses import asdict, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, cast
 
 import numpy as np
 
-from fits._files import (
-    given_path,
-    locked,
-    read_json,
-    replacing,
-    require_switch,
-    require_there,
-    text_checksum,
-    write_json,
-    write_text,
-)
+from fits import _files as files
 from fits.data.formats.csv import write_csv
 from fits.data.measurements import Measurements, Source
 from fits.data.reading import read
 from fits.data.spheres import Sphere, Spheres
 from fits.data.totals import Totals
+from fits.optimise.result import Fit, Minimum, WithoutDiscrepancy
+from fits.optimise.uncertainty import Direction
+from fits.problem.problem import Problem
+from fits.problem.stack_file import read_problem, transport_from_dict, transport_to_dict, write_problem
+from fits.reports.pages import versions
+from fits.sampling.posterior import Posterior
+from fits.sampling.sample import NoSteps, load
+from layerjax import Transport
+from layerjax._checks import require_kind
 
-if TYPE_CHECKING:
-    from fits.optimise.result import Fit
-    from fits.problem.problem import Problem
-    from fits.sampling.posterior import Posterior
-
-SCHEMA = 5
+SCHEMA = 6
 FIT, HELD_OUT, REPORT, SUMMARY, LOCK = "fit.json", "held_out.csv", "report.html", "summary.json", "chain.db.lock"
 DATA, PROBLEM, FITTED, CHAIN = "data.csv", "problem.toml", "fitted.toml", "chain.db"
-PACKAGES = ("jax", "equinox", "optimistix", "emcee", "numpy", "scipy")
+_FIELDS = [one.name for one in fields(Fit) if one.name not in ("problem", "alternatives", "without_discrepancy_parts")]
 
 
 # ---- fits ----
 
 
-def save_fit(fit: "Fit", directory: str | Path, force: bool = False) -> None:
+def save_fit(fit: Fit, directory: str | Path, force: bool = False) -> None:
     """Writes a result directory, without report, whole or not at all.
 
     Args:
@@ -62,121 +55,84 @@ def save_fit(fit: "Fit", directory: str | Path, force: bool = False) -> None:
             part of the stack is a function or class of one's own, which a file cannot name; the fit is of several
             measurements (see `Fit.part`).
     """
-    from fits.optimise.result import Fit
-    from layerjax._checks import require_kind
-
     require_kind("fit", fit, Fit)
     fit.require_one("save_fit")
     with writing(directory, force) as folder:
         write_fit(fit, folder)
 
 
-def write_fit(fit: "Fit", folder: Path, text: str | None = None) -> None:
+def write_fit(fit: Fit, folder: Path, text: str | None = None) -> None:
     """The files of a fit, into a folder that holds none.
 
     text: the stack file as the user wrote it, which is kept as it is; it must describe the problem of the fit.
     """
-    from fits.problem.parameters import Free
-    from fits.problem.stack_file import transport_to_dict, write_problem
-    from layerjax import Transport
-
     problem, transport, data = fit.problem, fit.problem.transport, fit.problem.data
     if transport != "auto" and not isinstance(transport, Transport):
         raise ValueError(f"transport is {transport!r}: only 'auto' and layerjax's own can be saved")
-    scale = problem.scale if isinstance(problem.scale, Free) else None
     spheres = data.spheres if isinstance(data, Totals) else None  # which the file cannot hold
     write_csv(data, folder / DATA)
     if text is not None:
-        write_text(folder / PROBLEM, text)
+        files.write_text(folder / PROBLEM, text)
     else:
-        settings = {name: getattr(problem, name) for name in ("noise", "objective", "instrument")}
-        write_problem(folder / PROBLEM, problem.stack, transport=transport, scale=scale, **settings)
+        settings = {name: getattr(problem, name) for name in ("noise", "scale", "objective", "instrument")}
+        write_problem(folder / PROBLEM, problem.stack, transport=transport, **settings)
     write_problem(folder / FITTED, fit.stack, transport=transport)
     numbers = ("values", "standard_errors", "units", "chi_square", "degrees_of_freedom")
+    plain = asdict(replace(fit, problem=cast(Any, None)))
     content = {
         "layerjax_result": SCHEMA,
         "versions": versions(),
         "transport": transport_to_dict(transport),  # with the resolution that the fit chose
         "source": asdict(data.source),
         "spheres": None if spheres is None else asdict(spheres),
-        "fixed_scale": None if scale is not None else problem.scale,
         **{name: getattr(fit, name) for name in numbers},
-        "fit": {name: _stored(getattr(fit, name)) for name in _fields()},
-        "minima": [{"values": one.values, "cost": one.cost, "count": one.count} for one in fit.minima],
+        "fit": {name: plain[name] for name in _FIELDS},
         "alternatives": [k for k, one in enumerate(fit.minima) if any(one is same for same in fit.alternatives)],
-        "checksums": {name: text_checksum(folder / name) for name in (DATA, PROBLEM)},
+        "checksums": {name: files.text_checksum(folder / name) for name in (DATA, PROBLEM)},
     }
-    write_json(folder / FIT, content)
+    files.write_json(folder / FIT, content)
 
 
-def load_fit(directory: str | Path) -> "Fit":
+def load_fit(directory: str | Path) -> Fit:
     """The fit that was saved in a directory.
 
     Raises:
         ValueError, FileNotFoundError: on one line, for a directory that holds none, a damaged one, or none at all.
     """
-    from fits.optimise.result import Fit, Minimum, WithoutDiscrepancy
-    from fits.optimise.uncertainty import Direction
-
-    directory = given_path("directory", directory)
-    require_there(directory, "no such directory")
+    directory = files.given_path("directory", directory)
+    files.require_there(directory, "no such directory")
     if not (directory / FIT).is_file():
         raise ValueError(f"{directory}: is not a result directory, it holds no {FIT}")
-    content = read_json(directory / FIT)
+    content = files.read_json(directory / FIT)
     if (version := content.get("layerjax_result")) != SCHEMA:
         raise ValueError(f"{directory / FIT}: is version {version} of the format, must be {SCHEMA}")
     for name in (DATA, PROBLEM):
-        require_there(directory / name)
-        if text_checksum(directory / name) != content.get("checksums", {}).get(name):
+        files.require_there(directory / name)
+        if files.text_checksum(directory / name) != content.get("checksums", {}).get(name):
             raise ValueError(f"{directory / name}: damaged or changed since the fit, its checksum is not that in {FIT}")
     try:
-        problem = _problem(directory, content)
-        stored = {name: _restored(content["fit"][name]) for name in _fields()}
+        # the problem: stack file and data, with what the fit chose beside them
+        given, data, spheres = read_problem(directory / PROBLEM), read(directory / DATA), content["spheres"]
+        data = replace(data, source=Source(**content["source"] | {"notes": tuple(content["source"]["notes"])}))
+        if isinstance(data, Totals) and spheres is not None:
+            both = ("reflection", "transmission")
+            spheres |= {name: None if spheres[name] is None else Sphere(**spheres[name]) for name in both}
+            data = replace(data, spheres=Spheres(**spheres))
+        added = content["fit"]["without_discrepancy"] is not None
+        noise = replace(given.noise, discrepancy=True) if added else given.noise
+        transport = transport_from_dict(content["transport"])
+        problem = Problem(given.stack, data, transport, noise, given.scale, given.objective, given.instrument)
+        # its numbers
+        stored = {name: _restored(content["fit"][name]) for name in _FIELDS}
         stored |= {name: np.array(stored[name], float) for name in ("vector", "errors", "covariance")}
         stored["unidentified"] = tuple(Direction(**one) for one in stored["unidentified"])
         if stored["without_discrepancy"] is not None:
             stored["without_discrepancy"] = WithoutDiscrepancy(**stored["without_discrepancy"])
-        minima = tuple(
-            Minimum(**one, stack=problem.build(np.array(list(one["values"].values()))).stack)
-            for one in _restored(content["minima"])
-        )
-        alternatives = tuple(minima[index] for index in content["alternatives"])
-        return Fit(problem=problem, minima=minima, alternatives=alternatives, **stored)
+        stored["minima"] = tuple(Minimum(**one) for one in stored["minima"])
+        alternatives = tuple(stored["minima"][index] for index in content["alternatives"])
+        return Fit(problem=problem, alternatives=alternatives, **stored)
     except (LookupError, TypeError, AttributeError) as error:
         raise ValueError(f"{directory / FIT}: damaged, it is not what `save_fit` writes") from error
-
-
-def _problem(directory: Path, content: dict[str, Any]) -> "Problem":
-    """The fitting problem: the stack file and the data, with what the fit chose beside them."""
-    from fits.problem.problem import Problem
-    from fits.problem.stack_file import read_problem, transport_from_dict
-
-    given, data, spheres = read_problem(directory / PROBLEM), read(directory / DATA), content["spheres"]
-    data = replace(data, source=Source(**content["source"] | {"notes": tuple(content["source"]["notes"])}))
-    if isinstance(data, Totals) and spheres is not None:
-        both = ("reflection", "transmission")
-        spheres |= {name: None if spheres[name] is None else Sphere(**spheres[name]) for name in both}
-        data = replace(data, spheres=Spheres(**spheres))
-    added = content["fit"]["without_discrepancy"] is not None
-    noise = replace(given.noise, discrepancy=True) if added else given.noise
-    scale = given.scale if given.scale is not None else content["fixed_scale"]
-    transport = transport_from_dict(content["transport"])
-    return Problem(given.stack, data, transport, noise, scale, given.objective, given.instrument)
-
-
-def _fields() -> list[str]:
-    """Fields of a fit that are stored as they are."""
-    from fits.optimise.result import Fit
-
-    others = {"problem", "minima", "alternatives", "without_discrepancy_parts"}
-    return [one.name for one in fields(Fit) if one.name not in others]
-
-
-def _stored(value: Any) -> Any:
-    """The value with its dataclasses as mappings."""
-    if isinstance(value, tuple):
-        return [_stored(one) for one in value]
-    return asdict(value) if is_dataclass(value) and not isinstance(value, type) else value
 
 
 def _restored(value: Any) -> Any:
@@ -197,7 +153,7 @@ def load_held_out(directory: str | Path) -> Measurements | None:
 # ---- posteriors ----
 
 
-def load_posterior(directory: str | Path) -> "Posterior | None":
+def load_posterior(directory: str | Path) -> Posterior | None:
     """The posterior that was sampled in a result directory, as far as it got; None before its first step.
 
     Its estimates are refused where the chain is too short, unless it was saved as one to be reported all the same.
@@ -206,13 +162,11 @@ def load_posterior(directory: str | Path) -> "Posterior | None":
         FileNotFoundError: there is no such directory.
         ValueError: on one line, for a damaged file.
     """
-    from fits.sampling.sample import NoSteps, load
-
-    directory = given_path("directory", directory)
-    require_there(directory, "no such directory")
+    directory = files.given_path("directory", directory)
+    files.require_there(directory, "no such directory")
     if not (directory / CHAIN).is_file():
         return None
-    summary = read_json(directory / SUMMARY) if (directory / SUMMARY).is_file() else {}
+    summary = files.read_json(directory / SUMMARY) if (directory / SUMMARY).is_file() else {}
     try:
         posterior = load(load_fit(directory), directory / CHAIN)
     except NoSteps:
@@ -221,14 +175,14 @@ def load_posterior(directory: str | Path) -> "Posterior | None":
     return replace(posterior, allow_unconverged=allowed)  # not by a summary of a longer chain, which has been replaced
 
 
-def save_posterior(posterior: "Posterior", directory: str | Path) -> None:
+def save_posterior(posterior: Posterior, directory: str | Path) -> None:
     """Writes the estimates beside the chain that `fits.sample` keeps in the directory.
 
     Raises:
         ValueError: the chain is too short to report from.
     """
-    names = ["converged", "allow_unconverged", "burn_in", "acceptance", "status", "divergences"]
-    names += ["autocorrelation_time", "effective_samples", "r_hat"]
+    names = ["converged", "allow_unconverged", "burn_in", "acceptance", "status", "divergences", "autocorrelation_time"]
+    names += ["effective_samples", "r_hat"]
     content = {
         "layerjax_result": SCHEMA,
         "versions": versions(),
@@ -241,14 +195,7 @@ def save_posterior(posterior: "Posterior", directory: str | Path) -> None:
             for name, estimates in posterior.summary().items()
         },
     }
-    write_json(Path(directory) / SUMMARY, content, force=True)
-
-
-def versions() -> dict[str, str]:
-    """Versions of the packages that a result depends on."""
-    import layerjax
-
-    return {"layerjax": layerjax.__version__} | {package: metadata.version(package) for package in PACKAGES}
+    files.write_json(Path(directory) / SUMMARY, content, force=True)
 
 
 # ---- directories ----
@@ -265,7 +212,7 @@ def check_directory(directory: Path, force: bool) -> None:
     if not force:
         raise ValueError(f"{directory}: holds a result already (--force, or force=True, replaces it)")
     if (directory / LOCK).exists():
-        with locked(directory / LOCK, str(directory)):
+        with files.locked(directory / LOCK, str(directory)):
             pass
 
 
@@ -278,11 +225,11 @@ def writing(directory: str | Path, force: bool = False) -> Iterator[Path]:
     Raises:
         ValueError: another process writes it; or it is not empty, unless `force` is given and it is an earlier result.
     """
-    directory = given_path("directory", directory)
-    require_switch("force", force)
+    directory = files.given_path("directory", directory)
+    files.require_switch("force", force)
     check_directory(directory, force)
     target = directory.resolve()
-    with locked(target.with_name(f".{target.name}.lock"), str(directory)), replacing(target) as folder:
+    with files.locked(target.with_name(f".{target.name}.lock"), str(directory)), files.replacing(target) as folder:
         try:
             yield folder
         except OSError as error:

@@ -4,24 +4,20 @@ import csv
 import io
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, TextIO
+from typing import TextIO
 
 import numpy as np
 
 from fits.data.geometry import azimuth, polar
 from fits.data.measurements import Measurements
 from fits.data.scans import incidences
-from fits.optimise.limits import instrument_limits
-from fits.prediction.predict import LEVELS, scores
+from fits.optimise.result import Fit
+from fits.prediction.compare import Comparison
+from fits.prediction.predict import LEVELS, Prediction, scores
+from fits.problem.problem import Problem
 from fits.reports.pages import Table
-from fits.reports.verdicts import identifiability, numerical_error, standardised
-
-if TYPE_CHECKING:
-    from fits.optimise.result import Fit
-    from fits.prediction.compare import Comparison
-    from fits.prediction.predict import Prediction
-    from fits.problem.problem import Problem
-    from fits.sampling.posterior import Posterior
+from fits.reports.verdicts import identifiability, instrument_limits, standardised
+from fits.sampling.posterior import Posterior
 
 MOST_MINIMA = 8
 UNRELIABLE = (
@@ -73,7 +69,7 @@ def shortened(rows: Sequence[tuple[str, ...]], most: int = 40) -> tuple[tuple[st
     return (*rows[: most // 2], gap, *rows[len(rows) - most // 2 :])
 
 
-def noise_in_words(problem: "Problem") -> str:
+def noise_in_words(problem: Problem) -> str:
     """The noise model of a problem in one line."""
     noise, start = problem.noise, problem.build(problem.start)
     parts = ["the file's own sigma"] if noise.use_sigma and problem.data.sigma is not None else []
@@ -91,23 +87,20 @@ def noise_in_words(problem: "Problem") -> str:
 # ---- tables of a fit ----
 
 
-def problem_rows(fit: "Fit") -> tuple[tuple[str, str], ...]:
+def problem_rows(fit: Fit) -> tuple[tuple[str, str], ...]:
     """What was fitted beside the data: noise model, objective, scale and transport."""
     problem = fit.problem
     fixed = problem.scale is None or isinstance(problem.scale, int | float)
     transport = problem.transport if isinstance(problem.transport, str) else type(problem.transport).__name__
-    rows = [
+    return (
         ("noise", noise_in_words(problem)),
         ("objective", problem.objective),
         ("scale", f"fixed at {problem.scale or 1:g}" if fixed else "fitted, see the table of values"),
         ("transport", transport if fit.resolution is None else f"{transport}, {fit.resolution}"),
-    ]
-    if fit.resolution:
-        rows.append(("numerical error of the model", numerical_error(fit.numerical_error)))
-    return tuple(rows)
+    )
 
 
-def parameter_table(fit: "Fit", both: bool = False) -> Table:
+def parameter_table(fit: Fit, both: bool = False) -> Table:
     """Value, standard error, unit, bounds and identifiability of each fitted parameter.
 
     both: where a model discrepancy was added, also the value with independent noise.
@@ -131,7 +124,7 @@ def parameter_table(fit: "Fit", both: bool = False) -> Table:
     return Table("Fitted parameters", columns, tuple(rows), " ".join(notes))
 
 
-def minima_table(fit: "Fit") -> Table:
+def minima_table(fit: Fit) -> Table:
     """The minima that the starts reached, a column each, best first: how many starts, the cost, the values there."""
     minima = fit.minima[:MOST_MINIMA]
     heads = ["same cost" if any(one is other for other in fit.alternatives) else "higher cost" for one in minima[1:]]
@@ -145,7 +138,7 @@ def minima_table(fit: "Fit") -> Table:
     return Table("Minima that the starts reached", ("", "best", *heads), tuple(rows), note)
 
 
-def unidentified_table(fit: "Fit") -> Table:
+def unidentified_table(fit: Fit) -> Table:
     """Directions of parameter space that the data do not identify, with the conditional errors of their parameters."""
     rows = []
     for place, direction in enumerate(fit.unidentified, 1):
@@ -164,7 +157,16 @@ def unidentified_table(fit: "Fit") -> Table:
     return Table(f"{kind} directions of parameter space", columns, tuple(rows), note)
 
 
-def posterior_table(posterior: "Posterior") -> Table:
+def correlation_table(fit: Fit) -> Table:
+    """Correlations of the fitted parameters, which are numbered."""
+    rows = []
+    for number, (name, correlations) in enumerate(zip(fit.values, fit.correlation, strict=True)):
+        words = [f"{value:+.2f}" if math.isfinite(value) else "" for value in correlations[:number]]
+        rows.append((f"{name} ({number + 1})", *words, *[""] * (len(fit.values) - 1 - number)))
+    return Table("Correlations", ("", *map(str, range(1, len(rows)))), tuple(rows))
+
+
+def posterior_table(posterior: Posterior) -> Table:
     """Median, 68 % interval, standard deviation, unit and effective sample size of each parameter."""
     effective = np.broadcast_to(posterior.effective_samples, len(posterior.names))
     rows = []
@@ -176,7 +178,7 @@ def posterior_table(posterior: "Posterior") -> Table:
     return Table("Posterior", columns, tuple(rows), note)
 
 
-def incidence_table(fit: "Fit") -> Table:
+def incidence_table(fit: Fit) -> Table:
     """Residuals of each incidence, and of all, in standard deviations."""
     residuals, data = standardised(fit), fit.problem.data
     groups = [(degrees(one.theta), residuals[one.rows]) for one in incidences(data)]
@@ -191,7 +193,7 @@ def incidence_table(fit: "Fit") -> Table:
 # ---- tables of several fits, and of predictions ----
 
 
-def comparison_table(comparison: "Comparison") -> Table:
+def comparison_table(comparison: Comparison) -> Table:
     """One row per fit, the best first: goodness of fit, number of parameters, and predictive score or else AIC."""
     rows = []
     aic, bic = min(row.aic for row in comparison.rows), min(row.bic for row in comparison.rows)
@@ -214,7 +216,7 @@ def comparison_table(comparison: "Comparison") -> Table:
     return Table("Comparison", tuple(cells), tuple(rows), note)
 
 
-def scores_table(prediction: "Prediction", data: Measurements, title: str) -> Table:
+def scores_table(prediction: Prediction, data: Measurements, title: str) -> Table:
     """Errors, coverage and predictive score of held-out data, for each incidence and for all of them."""
     used, rows = data.used(), []
     groups = [(one.label, np.isin(np.arange(len(used)), one.rows)) for one in incidences(used)]
@@ -232,11 +234,10 @@ def scores_table(prediction: "Prediction", data: Measurements, title: str) -> Ta
     return Table(title, heads, tuple(rows), note)
 
 
-def prediction_csv(prediction: "Prediction") -> str:
+def prediction_csv(prediction: Prediction) -> str:
     """A row for each pair of directions and channel: angles in degrees, all else in 1/sr.
 
-    Columns `bsdf_...` are the best estimate, of the stack with the model discrepancy; `predictive_...` of a new
-    measurement; `latent_...` of the stack without the discrepancy.
+    Columns `bsdf_...`: the stack with discrepancy; `predictive_...`: a new measurement; `latent_...`: the stack alone.
     """
     out = io.StringIO()
     numbers: dict[str, np.ndarray] = {}

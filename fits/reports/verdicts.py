@@ -2,47 +2,45 @@
 
 `assess` collects the facts of a fit, and `statements` depend on these alone. Each says what it claims of the errors,
 the residuals, the noise or the parameters, so that a test can go through all combinations of facts and find that no two
-statements of a report contradict each other. With a model discrepancy, statements on residuals are about those whitened
-by the fitted covariance.
+statements of a report contradict each other. With a model discrepancy, residuals are those whitened by the covariance.
 """
 
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from fits.data.scans import correlation, neighbours
-from fits.optimise.limits import instrument_limits
+import layerjax as lj
+from fits.data.measurements import Measurements
+from fits.data.scans import correlation, in_plane, neighbours, scans, signed_angle
 from fits.optimise.options import FitOptions
-from fits.optimise.result import OUTCOMES
+from fits.optimise.result import Fit, numerical_error_in_words
 from fits.optimise.uncertainty import UNCONSTRAINED_BEYOND, UNIDENTIFIED_BEYOND, Direction
 from fits.problem.model import Model
 from fits.problem.noise import DEFAULT_RELATIVE
+from fits.sampling.posterior import Posterior
 from layerjax._checks import require_number
-
-if TYPE_CHECKING:
-    from fits.optimise.result import Fit
-    from fits.sampling.posterior import Posterior
+from layerjax.mixture import stacks_by_name
 
 
 @dataclass(frozen=True)
 class ReportOptions:
-    """Thresholds that decide what a report says."""
+    """Thresholds that decide what a report says.
+
+    Attributes:
+        significance: standard errors from which a chi-square, or a correlation of residuals, is not chance.
+        misfit: median misfit, in standard deviations of the stated noise, above which a significant misfit means that
+            the stack does not describe the sample; that of the true stack is 0.67.
+        correlated: absolute correlation from which the table of parameters names the partner of a parameter.
+        prior_dominated: standard error, as a share of the bounds, above which a parameter is called prior-dominated.
+    """
 
     significance: float = 3.0
-    """Standard errors from which a chi-square, or a correlation of residuals, is not chance."""
-
     misfit: float = 1.5
-    """Median misfit, in standard deviations of the stated noise, above which a significant misfit means that the stack
-    does not describe the sample; that of the true stack is 0.67."""
-
     correlated: float = 0.95
-    """Absolute correlation from which the table of parameters names the partner of a parameter."""
-
     prior_dominated: float = 0.3
-    """Standard error, as a share of the bounds, above which a parameter is called prior-dominated."""
 
     def __post_init__(self) -> None:
         for field in fields(self):
@@ -60,7 +58,7 @@ NOISE_ASSUMED = (
 # ---- residuals ----
 
 
-def over_all_rows(fit: "Fit", values: np.ndarray) -> np.ndarray:
+def over_all_rows(fit: Fit, values: np.ndarray) -> np.ndarray:
     """Values (used samples, C) of a fit spread over every row of its data, (N, C); NaN in rows that were not used."""
     mask = fit.problem.data.mask
     spread = np.full((len(mask), np.shape(values)[1]), np.nan)
@@ -68,7 +66,7 @@ def over_all_rows(fit: "Fit", values: np.ndarray) -> np.ndarray:
     return spread
 
 
-def standardised(fit: "Fit") -> np.ndarray:
+def standardised(fit: Fit) -> np.ndarray:
     """Residuals of every row that are independent standard normal if the model holds, (N, C); NaN in unused rows.
 
     They are in units of the noise; with a model discrepancy, whitened by the covariance of both.
@@ -76,9 +74,52 @@ def standardised(fit: "Fit") -> np.ndarray:
     return over_all_rows(fit, fit.residuals / residual_unit(fit))
 
 
-def residual_unit(fit: "Fit") -> float:
+def residual_unit(fit: Fit) -> float:
     """Noise, or the scatter that is left where a named objective has no noise model."""
     return 1.0 if fit.is_posterior else math.sqrt(fit.chi_square / max(fit.degrees_of_freedom, 1))
+
+
+# ---- what an instrument does not resolve ----
+
+# tangent of the half vector, over alpha, at which facets are half as many as along the normal
+HALF = {"ggx": math.sqrt(math.sqrt(2.0) - 1.0), "vmf": math.sqrt(math.log(2.0))}
+STEPS = 2.0  # of a scan, that a lobe has to hold within its full width at half maximum
+NEAR = 10.0  # degrees from the mirror direction within which steps of a scan count
+
+
+def instrument_limits(fit: Fit) -> dict[str, float]:
+    """Fitted roughnesses whose lobe is narrower than what can be seen of it, and the least alpha that could be.
+
+    A mirror lobe is as wide as its full width at half maximum, in the angle of the viewer. That has to be wider than
+    the aperture of the `Instrument`, and hold two steps of the scan that is finest about the mirror direction.
+    """
+    instrument, material = fit.problem.instrument, fit.problem.stack
+    aperture = 0.0 if instrument is None else math.hypot(instrument.source_aperture, instrument.detector_aperture)
+    resolved, found = max(aperture, STEPS * finest_step(fit.problem.data.used())), dict[str, float]()
+    for prefix, stack in stacks_by_name(material).items() if isinstance(material, lj.Stack | lj.Mixture) else ():
+        parts = {f"{prefix}layers[{place}].alpha": layer for place, layer in enumerate(stack.layers)}
+        for name, part in (parts | {f"{prefix}base.alpha": stack.base}).items():
+            if isinstance(part, lj.Interface | lj.Conductor) and name in fit.values:
+                least = math.tan(math.radians(resolved / 4.0)) / HALF[part.distribution]
+                found |= {name: least} if fit.values[name] < least else {}
+    return found
+
+
+def finest_step(data: Measurements) -> float:
+    """Degrees between neighbours about the mirror direction, of the scan that is finest there; 0 if none crosses it."""
+    signed, plane = signed_angle(data), in_plane(data)
+    steps = []
+    for rows in scans(data):
+        rows = rows[plane[rows]]
+        angle, mirror = signed[rows], float(data.theta_i[rows[0]]) if rows.size else 0.0
+        if rows.size < 2 or not angle.min() <= mirror <= angle.max():
+            continue
+        gaps = np.diff(angle)
+        middle = 0.5 * (angle[1:] + angle[:-1])
+        near = (np.abs(middle - mirror) <= NEAR) & (gaps > 0.0)
+        if near.any():
+            steps.append(float(np.min(gaps[near])))
+    return min(steps, default=0.0)
 
 
 # ---- facts ----
@@ -88,25 +129,20 @@ def residual_unit(fit: "Fit") -> float:
 class Assessment:
     """The facts of a fit that decide what is said of it; residuals are whitened where there is a model discrepancy."""
 
+    fit: Fit
     options: ReportOptions
     count: int  # of residuals
     lag_one: float  # correlation of neighbours in angle; NaN without any
     pairs: int  # of neighbours
     ratio: float  # chi-square per degree of freedom
-    freedom: int  # degrees of freedom
     excess: float  # chi-square above its expectation, in its own standard deviations
-    converged: bool
-    likelihood: bool  # whether the objective is one
     noise_assumed: bool
     described: bool  # whether the stack without discrepancy is as near to the data as noise and options allow
     misfit: tuple[float, float] | None  # factors within which half and 95 % of the positive data are of that stack
     noise: float  # median of the stated noise as a share of the value; NaN if none is above zero
     discrepancy: tuple[Any, float] | None  # its parameters, and the reduced chi-square without it
-    unidentified: tuple[Direction, ...]
     words: Mapping[str, str]  # of each parameter, see `identifiability`
-    alternatives: int  # other minima that fit equally well
-    numerical_error: float | None  # of the model, in standard deviations of the data
-    resolved: bool  # whether that is small enough
+    resolved: bool  # whether the numerical error is small enough
 
     @property
     def size(self) -> str:
@@ -145,7 +181,7 @@ class Assessment:
         return all(word == IDENTIFIED or word.startswith(CORRELATED) for word in self.physical.values())
 
 
-def assess(fit: "Fit", options: ReportOptions = DEFAULT) -> Assessment:
+def assess(fit: Fit, options: ReportOptions = DEFAULT) -> Assessment:
     """The facts of a fit."""
     used, likelihood, freedom = fit.problem.data.used(), fit.is_posterior, max(fit.degrees_of_freedom, 1)
     spread = math.sqrt(2.0 / freedom)  # of chi-square per degree of freedom about 1
@@ -172,24 +208,19 @@ def assess(fit: "Fit", options: ReportOptions = DEFAULT) -> Assessment:
     limit = float(fit.settings.get("numerical_error", FitOptions().numerical_error))
     pairs = neighbours(fit.problem.data, standardised(fit))
     return Assessment(
+        fit=fit,
         options=options,
         count=used.values.size,
         lag_one=correlation(*pairs),
         pairs=pairs[0].size,
         ratio=fit.reduced_chi_square,
-        freedom=fit.degrees_of_freedom,
         excess=(fit.reduced_chi_square - 1.0) / spread,
-        converged=fit.converged,
-        likelihood=likelihood,
         noise_assumed=likelihood and fit.problem.noise_is_assumed,
         described=described,
         misfit=misfit,
         noise=noise,
         discrepancy=discrepancy,
-        unidentified=fit.unidentified,
         words=identifiability(fit, options),
-        alternatives=len(fit.alternatives),
-        numerical_error=fit.numerical_error,
         resolved=fit.numerical_error is None or fit.numerical_error <= limit,
     )
 
@@ -197,7 +228,7 @@ def assess(fit: "Fit", options: ReportOptions = DEFAULT) -> Assessment:
 IDENTIFIED, CORRELATED = "identified", "correlated with"
 
 
-def identifiability(fit: "Fit", options: ReportOptions = DEFAULT) -> dict[str, str]:
+def identifiability(fit: Fit, options: ReportOptions = DEFAULT) -> dict[str, str]:
     """What the data say of each parameter, in a few words; directions count from 1, worst first.
 
     What counts is a parameter's own error along the unidentified directions, in units of its prior range: a parameter
@@ -257,7 +288,7 @@ def _description(f: Assessment) -> Statement:
         half, most = map(_deviation, f.misfit)
         which = "stack without model discrepancy" if f.discrepancy else "model"
         near = f"Half of the {f.count:,} measurements are within {half} of the {which}, 95 % within {most}"
-    if not f.likelihood:
+    if not f.fit.is_posterior:
         return Statement(f"{near}; the objective is a named residual, which has no noise model to judge this by.")
     if not f.described:
         misfit = "" if f.misfit is None else f": median misfit {half}, stated noise {100.0 * f.noise:.2g} %"
@@ -280,10 +311,10 @@ def _deviation(factor: float) -> str:
 
 def _errors(f: Assessment) -> Statement:
     """What the standard errors mean."""
-    if not f.converged:
+    if not f.fit.converged:
         words = "The fit did not converge: values are the best found, not a minimum, and have no valid errors."
         return Statement(words, {"errors": "invalid"})
-    if not f.likelihood:
+    if not f.fit.is_posterior:
         words = "The errors are scaled by the remaining scatter and are only indicative."
         return Statement(words, {"errors": "indicative"})
     if not f.described:
@@ -291,10 +322,10 @@ def _errors(f: Assessment) -> Statement:
         if f.discrepancy:
             words = "The standard errors include the model discrepancy, and hold only if it accounts for the misfit."
         return Statement(words, {"errors": "conditional", "description": "no"})
-    if f.alternatives:
+    if count := len(f.fit.alternatives):
         others = "Another local minimum of the same model fits"
-        if f.alternatives > 1:
-            others = f"{f.alternatives} other local minima of the same model fit"
+        if count > 1:
+            others = f"{count} other local minima of the same model fit"
         words = f"{others} equally well: the standard errors are those of the best one only, sampling covers all."
         return Statement(words, {"errors": "one minimum"})
     size, correlation = f.error_factors
@@ -324,7 +355,7 @@ def _parameters(f: Assessment) -> Statement:
     def weak(direction: Direction) -> list[str]:
         return [name for name in direction.weights if direction.error_of(name) > UNIDENTIFIED_BEYOND]
 
-    directions, parts = [one for one in f.unidentified if set(weak(one)) & set(words)], []
+    directions, parts = [one for one in f.fit.unidentified if set(weak(one)) & set(words)], []
     if directions:
         names, more = weak(directions[0]), " (and more)" if directions[1:] else ""
         kind = "unidentified" if directions[0].unconstrained else "weakly identified"
@@ -349,14 +380,12 @@ def _remarks(f: Assessment) -> list[Statement]:
         term, without = f.discrepancy
         amplitude, exponent = 100.0 * float(term.amplitude), float(term.grazing_exponent)
         grazing = f" at normal incidence, {amplitude * 2.0**exponent:.2g} % at 60°" if exponent > 0.0 else ""
-        lengths = (
-            f"{float(term.length_half):.2g}° (half angle), {float(term.length_difference):.2g}° (difference angle)"
-        )
-        words = f"Model discrepancy: {amplitude:.2g} % of the BSDF{grazing}; length scales {lengths}."
-        words = f"{words} The reduced chi-square is {f.ratio:.3g} with it and {without:.3g} without."
-        remarks.append(Statement(words))
+        half, difference = float(term.length_half), float(term.length_difference)
+        words = f"length scales {half:.2g}° (half angle), {difference:.2g}° (difference angle)"
+        words = f"Model discrepancy: {amplitude:.2g} % of the BSDF{grazing}; {words}. The reduced chi-square is"
+        remarks.append(Statement(f"{words} {f.ratio:.3g} with it and {without:.3g} without."))
     if not f.resolved:
-        error = numerical_error(f.numerical_error)
+        error = numerical_error_in_words(f.fit.numerical_error)
         remarks.append(Statement(f"The numerical error of the model is {error}: a finer resolution may change values."))
     if f.noise_assumed:
         remarks.append(Statement(NOISE_ASSUMED))
@@ -366,10 +395,10 @@ def _remarks(f: Assessment) -> list[Statement]:
 def _residuals(f: Assessment) -> list[Statement]:
     """Whether the residuals are what the noise model predicts; with a discrepancy, all is about the whitened ones."""
     residuals = [Statement("Residuals are in units of their own scatter: a named residual has no noise model.")]
-    if f.likelihood:
-        spread = math.sqrt(2.0 / max(f.freedom, 1))
-        words = f"The reduced chi-square of the {f.which} is {f.ratio:.3g} with {f.freedom} degrees of freedom, for"
-        words, claims = f"{words} which {f.expectation} predicts 1 ± {spread:.2g}", {"size": f.size}
+    if f.fit.is_posterior:
+        freedom, claims = f.fit.degrees_of_freedom, {"size": f.size}
+        words = f"The reduced chi-square of the {f.which} is {f.ratio:.3g} with {freedom} degrees of freedom, for"
+        words = f"{words} which {f.expectation} predicts 1 ± {math.sqrt(2.0 / max(freedom, 1)):.2g}"
         if f.size == "small" and not f.correlated:
             words, claims = f"{words}: sigma is too large, or holds a common error", claims | {"noise": "too large"}
         claims |= {} if f.size == "expected" else {"residuals": "misfit"}
@@ -393,7 +422,7 @@ class Verdict(NamedTuple):
     sound: bool
 
 
-def verdict(fit: "Fit", facts: Assessment | None = None) -> Verdict:
+def verdict(fit: Fit, facts: Assessment | None = None) -> Verdict:
     """How well the model describes the data, what the errors mean, and what the data identify."""
     facts = facts or assess(fit)
     said = statements(facts)
@@ -409,26 +438,14 @@ def verdict(fit: "Fit", facts: Assessment | None = None) -> Verdict:
     return Verdict([one.sentence for one in said["verdict"]], remarks, sound)
 
 
-def summary(fit: "Fit") -> list[str]:
-    """A few lines for the terminal: the verdict, chi-square, starts and numerical error."""
+def summary(fit: Fit) -> list[str]:
+    """A few lines for the terminal: the verdict, chi-square, and how the fit ended."""
     opening = verdict(fit)
     good = f"chi2/dof {fit.reduced_chi_square:.4g} ({fit.chi_square:.6g} / {fit.degrees_of_freedom})"
-    accurate = f"; numerical error of the model: {numerical_error(fit.numerical_error)}" if fit.resolution else ""
-    return [*opening.sentences, *opening.remarks, f"{good}; {starts_in_words(fit)}{accurate}"]
+    return [*opening.sentences, *opening.remarks, f"{good}; {fit.status}"]
 
 
-def starts_in_words(fit: "Fit") -> str:
-    """How many starts there were, and how they ended."""
-    counts = fit.start_outcomes
-    if not (total := sum(counts.values())):
-        return "starts are not recorded"
-    term = " with the discrepancy term" if fit.without_discrepancy is not None else ""
-    words = [f"{counts['best minimum']} of {total} starts{term} converged to the best minimum"]
-    words += [f"{counts[key]} {word}" for key, word in OUTCOMES.items() if key != "best minimum" and counts[key]]
-    return ", ".join(words) + ("; more starts may find a better one" if counts["best minimum"] == 1 < total else "")
-
-
-def sampled(posterior: "Posterior") -> list[str]:
+def sampled(posterior: Posterior) -> list[str]:
     """How long the chain is, whether that is long enough for its estimates, and which modes it has."""
     steps, walkers = posterior.chain.shape[:2]
     longest, worst = float(np.max(posterior.autocorrelation_time)), float(np.max(posterior.r_hat))
@@ -440,33 +457,25 @@ def sampled(posterior: "Posterior") -> list[str]:
         f"{posterior.acceptance:.0%} of the proposals were accepted; R-hat is at most {worst:.3f}.",
     ]
     if posterior.modes:
-        places = [
-            f"{100.0 * mode.share:.2g} ± {100.0 * mode.error:.1g} % at "
-            + ", ".join(f"{name} {value:.4g}" for name, value in mode.values.items())
-            for mode in posterior.modes
-        ]
+        places = []
+        for mode in posterior.modes:
+            values = ", ".join(f"{name} {value:.4g}" for name, value in mode.values.items())
+            places.append(f"{100.0 * mode.share:.2g} ± {100.0 * mode.error:.1g} % at {values}")
         words.append(f"The posterior has {len(places)} modes: {'; '.join(places)}. Estimates cover all of them.")
         if worst > options.r_hat:
             words.append(f"R-hat is above {options.r_hat:g}: the shares of the modes are uncertain.")
     if posterior.status:
         words.append(f"The sampler: {posterior.status}.")
     if not posterior.converged:
-        words.append(
-            f"The chain has not converged: {options.autocorrelation_times:g} autocorrelation times and R-hat of at "
-            f"most {options.r_hat:g} are needed: "
-            + ("do not quote these estimates." if reportable(posterior) else "it gives no estimates yet.")
-        )
+        needed = f"{options.autocorrelation_times:g} autocorrelation times and R-hat of at most {options.r_hat:g}"
+        what = "do not quote these estimates" if reportable(posterior) else "it gives no estimates yet"
+        words.append(f"The chain has not converged: {needed} are needed: {what}.")
     return words
 
 
-def reportable(posterior: "Posterior") -> bool:
+def reportable(posterior: Posterior) -> bool:
     """Whether estimates may be had from the chain."""
     return posterior.converged or posterior.allow_unconverged
-
-
-def numerical_error(error: float | None) -> str:
-    """How far the resolution keeps the model from its limit, in a few words."""
-    return "not known" if error is None or not math.isfinite(error) else f"{error:.2g} sigma at most"
 
 
 def listed(names: Sequence[str]) -> str:

@@ -1,4 +1,1 @@
-"""Pictures of data, models and parameters, as matplotlib figures that are neither shown nor written.
-
-Measurements, fits and posteriors go in; figures come out.
-"""
+"""Pictures of data, models and parameters: measurements, fits and posteriors go in; matplotlib figures come out."""

@@ -82,7 +82,7 @@ def test_sampling_resumes_until_it_is_enough(work, capsys, coat_fit, monkeypatch
         assert abs(entry["mean"] - coat_fit.values[name]) < coat_fit.standard_errors[name]
         assert entry["low_68"] < entry["median"] < entry["high_68"]
     pictures = (work / "result" / "report.html").read_text().count("data:image/png")
-    assert pictures == 4  # curves, maps, correlation, corner
+    assert pictures == 3  # curves, maps, corner
     monkeypatch.setattr(FitReport, "write", lambda *_: None)
     said = layerjax(f"sample result --ess 1000000 --max-steps {len(longer.chain)}", 1).out
     assert f"layerjax sample result --ess 1000000 --max-steps {2 * len(longer.chain)}" in said

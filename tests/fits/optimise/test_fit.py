@@ -185,9 +185,9 @@ def test_a_scale_with_its_prior():
     """Only scale times (a, b) is known; the prior on the logarithm decides the scale, and gives its error."""
     scale = Free(1.0, 0.5, 2.0, LogNormal(1.1, 0.05))
     result = fit(LINE, line_data(), transport=line, scale=scale, starts=4)
-    assert result.scale == pytest.approx(1.1, rel=1e-5)
+    assert result.values["scale"] == pytest.approx(1.1, rel=1e-5)
     assert result.standard_errors["scale"] == pytest.approx(0.05 * 1.1, rel=1e-4)
-    np.testing.assert_allclose(result.vector[:2] * result.scale, regression(line_data()), rtol=1e-5)
+    np.testing.assert_allclose(result.vector[:2] * result.values["scale"], regression(line_data()), rtol=1e-5)
 
 
 def test_a_named_residual_is_no_posterior():
@@ -201,7 +201,6 @@ def test_a_named_residual_is_no_posterior():
     np.testing.assert_allclose(result.errors, np.sqrt(np.diagonal(covariance)), rtol=1e-6)
     assert not result.is_posterior
     assert np.isnan(result.log_likelihood)
-    assert "no likelihood" in result.status
 
 
 def test_starts_that_fail_are_counted_and_not_believed():
@@ -257,7 +256,7 @@ PAINT = lj.Stack([], lj.Lambertian(Free(0.5, 0.0, 1.0)))
         (lambda: simulate(PAINT, slices(), noise=5), r"noise is 5; it must be a number in \[0, "),
         (lambda: Problem(PAINT, line_data(), lj.AddingDoubling(tolerance=0.01)), "0.01 needs concrete parameters"),
         (lambda: FitOptions(same_cost=0.0), r"FitOptions.same_cost is 0.0; it must be a number in \(0, inf\)"),
-        (lambda: options_from({"tolerance": 1.0}), r"\[options\] has an unknown key 'tolerance'; it must be one of"),
+        (lambda: options_from({"tolerance": 1.0}), r"\[options\] has an unknown key 'tolerance'; allowed: same_v"),
     ],
 )
 def test_refused(call, message):

@@ -8,10 +8,10 @@ import pytest
 import fits
 import layerjax as lj
 from benchmarks.measuring.cones import mean_over_cones
-from fits.optimise.limits import finest_step, instrument_limits
 from fits.optimise.uncertainty import unidentified_directions
 from fits.reports import verdicts
 from fits.reports.tables import parameter_table
+from fits.reports.verdicts import finest_step, instrument_limits
 
 
 def test_a_sum_that_alone_is_known_is_told_from_its_parts():

@@ -95,7 +95,6 @@ def test_what_takes_the_other_of_whole_and_part(joint):
     posterior = fits.Posterior(joint, chain, chain[..., 0], np.ones(3), 1.0, converged=True)
     for ask in (
         lambda: fits.compare({"one": joint, "other": joint}),
-        lambda: joint.scale,
         lambda: posterior.inference_data,
         lambda: fits.report(joint, path="never written"),
         lambda: fits.save_fit(joint, "never written"),
@@ -103,7 +102,6 @@ def test_what_takes_the_other_of_whole_and_part(joint):
     ):
         with pytest.raises(ValueError, match=r"of a joint fit it takes a part: fit.part\(...\) of first, second"):
             ask()
-    assert first.scale == 1.0
 
 
 def test_a_part_predicts_with_what_all_of_them_say(joint):

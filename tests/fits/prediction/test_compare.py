@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 
 from fits import ComparisonOptions, Free, compare, fit
-from fits.prediction.cross_validation import groups_of
+from fits.prediction.cross_validation import require_groups
 from tests.helpers.models import COUNT, LINE, design, line, line_data, measured
 
 FLAT = {"a": Free(0.9, -1.0, 3.0), "b": 0.0}
@@ -81,4 +81,6 @@ def test_thresholds_are_options(fits: dict) -> None:
     comparison = compare(fits, options=ComparisonOptions(slight_difference=1e6))
     assert "line and flat are statistically indistinguishable" in comparison.verdict
     assert comparison.options.slight_difference == 1e6
-    assert len(groups_of(DATA, ComparisonOptions(min_incidences=10**6, scan_parts=2))) <= 2
+    assert len(require_groups(fits["line"])) > 2
+    with pytest.raises(ValueError, match="too few measurements to hold some of them out"):
+        require_groups(fits["line"], ComparisonOptions(min_incidences=10**6))

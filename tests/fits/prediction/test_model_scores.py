@@ -239,4 +239,3 @@ def test_what_is_worse_everywhere_is_distinguished(gaps: tuple[float, ...], clea
     known = Evidence(0.0, 0.1, 0.1)
     seen = rank_models({"best": best, "other": other}, {"best": known, "other": known})["other"]
     assert (seen.clear_diff > 0.0) == clear
-    assert seen.least_diff == pytest.approx(min(gaps) / 10.0)

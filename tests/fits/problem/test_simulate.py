@@ -4,7 +4,7 @@ import numpy as np
 from scipy import stats
 
 import layerjax as lj
-from fits.problem.simulate import simulate, slices
+from fits import simulate, slices
 
 ALBEDO = np.array([0.2, 0.4, 0.6])
 PAINT = lj.Stack([], base=lj.Lambertian(albedo=ALBEDO))

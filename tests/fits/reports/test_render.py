@@ -36,6 +36,11 @@ def test_an_opaque_material_has_no_picture_from_behind() -> None:
     assert not any("transmitted" in title for title in titles)
 
 
+def test_a_sheet_is_also_seen_from_behind() -> None:
+    titles = [axes.get_title(loc="left") for axes in render(lj.Stack([lj.Medium(0.7, 0.9)]), SINGLE, size=16).axes]
+    assert {"from behind", "BSDF in the plane of incidence, transmitted"} <= set(titles)
+
+
 def test_bad_arguments_are_named() -> None:
     for size in (4, 1025, 100_000):
         with pytest.raises(ValueError, match=rf"size is {size}, must be in \[16, 1024\] pixels"):

@@ -20,7 +20,6 @@ from fits.reports import tables
 from fits.reports.data_summary import data_table, source_rows
 from fits.reports.html import FitReport
 from fits.reports.plots import data as pictures
-from fits.reports.plots import model as model_pictures
 from fits.reports.tables import Table, degrees, print_table, with_error
 from fits.reports.verdicts import standardised
 from tests.helpers.commands import refused
@@ -49,7 +48,9 @@ def test_the_report_holds_everything(coat_fit: Fit, tmp_path: Path) -> None:
         assert word in text, word
     assert "<coat>" not in text
     pictured = re.findall(r'src="([^"]{30})', text)
-    assert len(pictured) == 4  # curves, maps, correlation, comparison
+    assert len(pictured) == 3  # curves, maps, comparison
+    (correlation,) = re.findall(r"<td>base.albedo \(2\)</td><td class=.number.>([-+.\d]+)", text)
+    assert float(correlation) == pytest.approx(coat_fit.correlation[1, 0], abs=0.005)
     assert all(start.startswith("data:image/png;base64,") for start in pictured)
     assert "http" not in re.sub(r"base64,[^\"]*", "", text)
     with pytest.raises(ValueError, match="exists"):  # it replaces an earlier one only by force
@@ -107,18 +108,18 @@ def test_a_grey_stack_is_drawn_in_all_channels(coat_data: Measurements) -> None:
     stack = lj.Stack([lj.Medium(0.6, 0.8)], lj.Lambertian(Free(0.5, 0.0, 1.0)))
     grey = fit(stack, data, transport=lj.SingleScattering(), noise=Noise(relative=0.03), starts=1)
     assert grey.predicted.shape == data.used().values.shape
-    figure = model_pictures.curves_picture({"grey": grey})
+    figure = pictures.curves_picture({"grey": grey})
     assert isinstance(figure, Figure)
     assert sum(len(line.get_xdata()) > 100 for line in figure.axes[0].lines) == 3
 
 
 def test_maps_only_where_data_leaves_the_plane(coat_fit: Fit) -> None:
     data = coat_fit.problem.data
-    assert isinstance(model_pictures.maps_picture(coat_fit), Figure)
+    assert isinstance(pictures.maps_picture(coat_fit), Figure)
     assert len(pictures.data_picture(data).axes) == 4  # curves, two maps and their colour bar
     kept = in_plane(data)
     only = replace(data, wi=data.wi[kept], wo=data.wo[kept], values=data.values[kept], sigma=None, mask=data.mask[kept])
-    assert model_pictures.maps_picture(replace(coat_fit, problem=replace(coat_fit.problem, data=only))) is None
+    assert pictures.maps_picture(replace(coat_fit, problem=replace(coat_fit.problem, data=only))) is None
     assert len(pictures.data_picture(only).axes) == 1
     for azimuth in (60.0, (0.0, 90.0), tuple(range(0, 180, 10))):  # drawn however it lies, and though it is dark
         dark = along(slices(incidence=(0, 40), azimuth=azimuth), 0.0)

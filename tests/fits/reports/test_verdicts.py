@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from fits import Direction, Discrepancy, Fit, Noise, Problem, fit
 from fits.data.scans import correlation, neighbours, signed_angle
 from fits.reports import tables, verdicts
-from fits.reports.plots.model import bsdf, curves_picture, misfit
+from fits.reports.plots.data import bsdf, curves_picture, misfit
 from fits.reports.verdicts import assess, identifiability, standardised
 from tests.helpers.models import POSITIVE_LINE, SCANS, along, line, wrong_line
 
@@ -54,18 +54,18 @@ def test_no_two_statements_contradict_each_other(coat_fit: Fit) -> None:
     for converged, likelihood, stated, described, excess, lag, term, others, identified in table:
         if not described and (not likelihood or (term is None and excess <= 0.0)):
             continue  # what is not described has a large chi-square, at least without the discrepancy
+        fitted = SimpleNamespace(converged=converged, is_posterior=likelihood, alternatives=range(others))
+        vars(fitted).update(degrees_of_freedom=400, unidentified=identified.get("unidentified", ()))
         case = replace(
             facts,
-            converged=converged,
-            likelihood=likelihood,
+            fit=fitted,
             noise_assumed=not stated,
             described=described,
             excess=excess,
             ratio=sizes[excess],
             lag_one=lag,
             discrepancy=term,
-            alternatives=others,
-            **identified,
+            words=identified["words"],
         )
         said = [one for some in verdicts.statements(case).values() for one in some]
         claims: dict[str, str] = {}
@@ -103,7 +103,14 @@ def test_the_verdict_is_three_sentences_and_quotes_the_misfit(coat_fit: Fit) -> 
     half, most = map(float, re.findall(r"([\d.e-]+) %", found.sentences[0])[::2])
     assert np.mean(errors < 0.01 * half) == pytest.approx(0.5, abs=0.05)
     assert np.mean(errors < 0.01 * most) == pytest.approx(0.95, abs=0.05)
-    for change in ({"converged": False}, {"excess": 9.0, "ratio": 9.0}, {"alternatives": 1}, {"resolved": False}):
+    other = replace(coat_fit, alternatives=coat_fit.minima[:1])
+    bad = (
+        {"fit": replace(coat_fit, converged=False)},
+        {"fit": other},
+        {"excess": 9.0, "ratio": 9.0},
+        {"resolved": False},
+    )
+    for change in bad:
         assert not verdicts.verdict(coat_fit, replace(facts, **change)).sound
 
 
