@@ -56,7 +56,8 @@ class Measurements(Pairs):
         source: where the samples came from.
 
     Raises:
-        ValueError: shapes do not fit together, or values, directions or sigma are out of range.
+        ValueError: shapes do not fit together, a number is not finite or too large, a direction is no unit vector, or
+            sigma is negative, or next to zero in a sample that is used.
     """
 
     wi: Floats
@@ -186,9 +187,9 @@ class Measurements(Pairs):
         )
 
     def without_retro(self, degrees: float) -> "Measurements":
-        """The same samples, masked closer than `degrees` (0 to 180) to retro-reflection, where the detector stands.
+        """The same samples, those closer than `degrees` (0 to 180) to retro-reflection masked.
 
-        Raises ValueError for an angle out of range.
+        A detector head blocks the beam there. Raises ValueError for an angle out of range.
         """
         _check_angle(degrees, 180.0)
         angle = np.degrees(2 * np.arcsin(np.clip(np.linalg.norm(self.wi - self.wo, axis=-1) / 2, 0, 1)))

@@ -45,11 +45,14 @@ class ReadOptions(FileOptions):
             Radiance), "fred", "astm" (E1392), "pab", "alta", "speos" or "ssdd"; None finds out from the content.
         quantity: what the numbers in the file are: "brdf", f in 1/sr; "brdf_cos", f |cos theta_o|; or
             "reflectance_factor", pi f. A CSV says so in its column names, and then this picks among them; Zemax,
-            LightTools, FRED and ASTM files hold "brdf" unless this says otherwise; ALTA files may need it.
-        geometry: for MERL and RGL only, the directions to look up; None: the default `slices`, or those of RGL's file.
+            LightTools, FRED and ASTM files hold "brdf" unless this says otherwise; ALTA files that do not say what they
+            hold need it; all others say it themselves.
+        geometry: for MERL and RGL only, the directions to look up; None: of MERL the default `slices`, of RGL the
+            directions at which the file has values.
         lookup: for MERL only, "centre" or "linear": see `fits.data.formats.merl.read`.
         bins: for MERL and RGL only: so many bins, or nodes, from all over the table, at most 100,000, or "all".
-        strata: for MERL only, what bins are equal shares of: "bins" of the table, or "flux", projected solid angles.
+        strata: for MERL only, what each of these bins stands for an equal share of: "bins" of the table, or "flux",
+            the projected solid angle of light and viewer.
         seed: of their choice.
         wavelengths, corrected: for iad's files only: see `read_slab`.
         min_retro_angle: mask measurements closer than so many degrees to retro-reflection.

@@ -71,10 +71,12 @@ def fit(
         stack: holds `Free` where a number is to be fitted; or a `Problem` or `Joint`, in which all else is said.
         data: only the samples that its mask leaves in are used.
         transport: see `Problem`. A resolution that is not given is chosen: coarse for the starts, at the end so fine
-            that the model's numerical error is below a tenth of the data's sigma, where that is within reach.
+            that the numerical error of the model stays below a tenth of the data's standard deviation, where that is
+            within reach. `Fit.problem` has it.
         noise, scale, objective, instrument: see `Problem`.
         starts: at least 1: the `Free.start` values, then scrambled Sobol points of the box (in the logarithm for
-            parameters with a `LogNormal` or `LogUniform` prior), drawn with `seed`. The lowest end of all is the fit.
+            parameters with a `LogNormal` or `LogUniform` prior), drawn with `seed`. The lowest end of all is the fit;
+            where a parameter ends on a bound, L-BFGS-B checks it.
         options: tolerances and thresholds.
         progress: called with ("fit", starts done, starts, note).
         checkpoint: a file that each start is kept in as it ends: a fit that was killed takes those that are there for

@@ -16,10 +16,13 @@ class FitOptions:
         same_values, same_errors: two starts converged to one minimum if no parameter differs by more than this share of
             its box plus this many standard errors (each counted up to a twentieth of the box).
         same_cost: and if their costs agree within this, in the log-posterior, times the reduced chi-square above 1.
-        equivalent_cost: below this difference in log-posterior, times the same, minima explain the data equally well.
-        autocorrelation, autocorrelation_errors: model discrepancy is added where residuals of neighbours correlate by
-            more than the first, and by more than so many standard errors of that (see `Noise.discrepancy`).
-        numerical_error: of the model, in sigma of the data, that a chosen resolution stays below, if that can be.
+        equivalent_cost: minima explain the data equally well if their log-posteriors differ by less than this, times
+            the reduced chi-square above 1.
+        autocorrelation, autocorrelation_errors: a fit with independent noise is fitted again with model discrepancy if
+            residuals of neighbours along the scans are correlated by more than the first, and by more than so many
+            standard errors of that (see `Noise.discrepancy`).
+        numerical_error: of the model, in standard deviations of the data: a resolution that is chosen stays below it,
+            where that is within reach.
     """
 
     same_values: float = 1e-3

@@ -55,7 +55,8 @@ class Fit:
     Attributes:
         problem: what was fitted to what.
         vector: (P,), best values in the problem's order, in physical units.
-        errors: (P,), standard errors with the parameters in `at_bound` kept there, NaN for these; infinite: unknown.
+        errors: (P,), standard errors, NaN for a parameter at a bound, infinite where the data do not identify it; those
+            of the others hold with the parameters in `at_bound` kept there.
         covariance: (P, P), of the parameters.
         cost: half the sum of squared residuals.
         at_bound: names of the parameters that ended on a bound.
@@ -65,13 +66,14 @@ class Fit:
         unidentified: the directions in the space of parameters that the data alone do not identify, worst first.
         minima: the minima that starts reached, best first.
         alternatives: those among `minima`, other than the best, that fit equally well (local minima of the same model).
-            `errors` are of the best alone; `fits.sample`, `fits.predict` and `fits.evidence` count all.
+            `errors` and `covariance` are of the best alone; `fits.sample`, `fits.predict` and `fits.evidence` count all
+            that hold a share of the posterior.
         insensitive: names of the parameters that the data say nothing about.
         settings: starts, seed, and the numbers of `FitOptions`.
         start_outcomes: how many starts ended where: "best minimum", "local minima", "maximum steps reached", "failed".
         numerical_error: of the model at the best values, in standard deviations of the data (for a named objective, of
-            the residuals): the largest difference from a finer resolution, or from a coarser one at the finest; that of
-            the rays for an instrument's cones is added. None where there is neither.
+            the residuals): the largest difference from a finer resolution, or where that is out of reach from a coarser
+            one, which is more; that of the rays for an instrument's cones is added. None where there is neither.
         resolution: of the transport, and the rays for cones, in words; None where there is neither. `problem` holds it.
         without_discrepancy: the fit without model discrepancy, if residuals showed that one is needed (see `Noise`).
         without_discrepancy_parts: of a `Joint`, the same by the names of measurements.

@@ -72,7 +72,8 @@ class ImportanceDraws:
         return self.pareto_k < max_pareto_k and self.effective_sample_size >= MIN_EFFECTIVE_DRAWS
 
     def resample(self, generator: np.random.RandomState, count: int) -> Floats:
-        """(count, P) draws of the posterior, unconstrained, by tempered weights where these are unreliable."""
+        """(count, P) draws of the posterior, unconstrained. Unreliable weights are tempered: draws then spread more
+        widely than the posterior, rather than repeat a few."""
         weights = self.log_weights if self.pareto_k < MAX_PARETO_K else _tempered(self.log_weights)
         return self.positions[_resample(weights, generator, count)]
 

@@ -10,15 +10,16 @@ class ComparisonOptions:
     """Thresholds of `fits.compare`, `fits.cross_validate` and `fits.average`.
 
     Attributes:
-        standard_errors: of an elpd difference, below which two models are statistically indistinguishable.
+        standard_errors: two models whose elpd differs by fewer of these are statistically indistinguishable.
         decisive_per_measurement: an elpd difference above this a measurement, in every group of held-out data, decides
             whatever its standard error: a few groups say little of the error of their sum.
         slight_difference: below this difference in AIC and BIC (for elpd: twice the difference less its error) two
             models are statistically indistinguishable (Burnham & Anderson 2002, Sec. 2.6; Kass & Raftery 1995).
-        clear_difference: above this difference hardly any doubt remains; between the two a preference is slight.
+        clear_difference: above this difference hardly any doubt remains; below it the data prefer a model slightly.
         max_pareto_k: of importance weights, above which the evidence is unreliable (Vehtari et al. 2024).
         max_reduced_chi_square: if that of every model is above this, a note says that none explains the data.
-        min_incidences: cross-validation holds out one incidence at a time, of fewer than so many parts of every scan.
+        min_incidences: cross-validation holds out one incidence at a time if there are so many, and parts of every scan
+            if there are fewer, as a fit of one incidence says little of another.
         scan_parts: parts of equal size that every scan is then divided into.
         monte_carlo_error: standard error that the elpd of a group of held-out data may have because draws of the
             posterior are few: more are taken until it is below this, or until there are `most_draws`.

@@ -63,12 +63,14 @@ class Prediction:
         wi, wo: directions, (M, 3).
         channels: C names.
         values: the stack's own value for each of D draws of the posterior, (D, M, C), in 1/sr.
-        means, scales: of a measurement for each draw, (D, M, C), in 1/sr; with a discrepancy, of its `logarithm`.
+        means, scales: location and scale of a measurement for each draw, (D, M, C), in 1/sr; with a discrepancy, of its
+            `logarithm`.
         softness: of that logarithm, (M, C) or (D, M, C), in 1/sr; None where values themselves are meant.
         discrepancy_sd: standard deviation of the discrepancy about `means`, (D, M, C), of the logarithm; None without.
         degrees_of_freedom: of Student's t; infinite for a Gaussian.
         seed: of the draws that `bsdf` and `predictive` summarise.
-        pareto_k: of the importance weights that draws are resampled by (see `fits.evidence`); NaN for a chain.
+        pareto_k: Pareto k of the importance weights that the draws of a fit's posterior are resampled by (see
+            `fits.evidence`); NaN for draws of a chain.
         effective_draws: effective sample size of the D draws of the posterior.
         measurements: the measurements that were predicted; None for a `Geometry`.
     """
@@ -248,8 +250,10 @@ def predict(
     """Predict the BSDF along other directions, and new measurements of it.
 
     Args:
-        fitted: a posterior, an average, or a fit: by importance (see `fits.evidence`), a joint one's part as normal.
-        at: pairs of directions, above a stack with a base; of `Measurements` the used samples, with their own sigma.
+        fitted: a posterior or an average; or a fit, whose posterior is sampled by importance (see `fits.evidence`). Of a
+            part of a joint fit that is its normal approximation.
+        at: pairs of directions, all in the upper hemisphere if the stack has a base; of `Measurements` their used samples,
+            with their own sigma.
         draws: draws of the posterior, at least 2.
         seed: random seed of draws and noise.
 

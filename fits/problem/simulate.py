@@ -37,7 +37,8 @@ def simulate(
         stack gives 0 and `floor` is 0 carry no noise, which no measurement does: they are masked.
 
     Raises:
-        ValueError: a negative `noise` or `floor`, a light below an opaque stack, or a transport that does not carry it.
+        ValueError: a negative `noise` or `floor`, a light below an opaque stack, or a transport that is random or
+            cannot carry the stack.
     """
     require_number("noise", noise, 0.0, 1.0)
     require_number("floor", floor, 0.0, sys.float_info.max)
