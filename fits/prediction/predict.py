@@ -250,10 +250,10 @@ def predict(
     """Predict the BSDF along other directions, and new measurements of it.
 
     Args:
-        fitted: a posterior or an average; or a fit, whose posterior is sampled by importance (see `fits.evidence`). Of a
-            part of a joint fit that is its normal approximation.
-        at: pairs of directions, all in the upper hemisphere if the stack has a base; of `Measurements` their used samples,
-            with their own sigma.
+        fitted: a posterior or an average; or a fit, whose posterior is sampled by importance (see `fits.evidence`), of
+            a part of a joint fit by its normal approximation.
+        at: pairs of directions, all in the upper hemisphere if the stack has a base; of `Measurements` their used
+            samples, with their own sigma.
         draws: draws of the posterior, at least 2.
         seed: random seed of draws and noise.
 
