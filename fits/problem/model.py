@@ -241,7 +241,7 @@ class Model(eqx.Module):
         The Jacobian A of these rows has the Fisher information A'A. The expected information needs first derivatives
         only and is never indefinite; for Gaussian noise that is known it is J'J. For a named objective: its residuals.
         """
-        predicted = _by_columns(vector, model=self)
+        predicted = self.predict(vector)
         whitened = None if self.process is None else self.whitened_at(vector, predicted, step)
         residuals = self.residuals_at(vector, predicted, step, whitened)
         return residuals, (predicted, self._information_rows(vector, predicted, whitened))
@@ -312,20 +312,6 @@ class Model(eqx.Module):
         scaled = (predicted / jax.lax.stop_gradient(sigma)).reshape(-1) if whitened is None else whitened.information
         levels = [jnp.sqrt(of_level) * jnp.log(sigma).reshape(-1)] if self.varying else []
         return jnp.concatenate([jnp.sqrt(of_mean) * scaled, *levels])
-
-
-@eqx.filter_custom_jvp
-def _by_columns(vector: Array, *, model: Model) -> Array:
-    """`Model.predict`, of which a Jacobian takes the columns of parameters that matter to it alone, each once."""
-    return model.predict(vector)
-
-
-@_by_columns.def_jvp
-def _(primals: tuple[Array], tangents: tuple[Array], *, model: Model) -> tuple[Array, Array]:
-    (vector,), (moved,) = primals, tangents
-    steps = jnp.eye(vector.size)[: model.moving]
-    value, columns = jax.vmap(lambda step: jax.jvp(model.predict, primals, (step,)), out_axes=(None, -1))(steps)
-    return value, columns @ moved[: model.moving]
 
 
 def linearise(model: Model, vector: Array) -> Linearisation:
