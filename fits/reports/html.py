@@ -1,6 +1,7 @@
 """Reports as HTML: the page of a fit, and what a notebook shows of results.
 
-A page opens with the verdict in three sentences; then come values, data and model, diagnostics and so on.
+A page opens with the verdict in three sentences; then come values, data and model, diagnostics, identifiability,
+posterior and comparison.
 """
 
 import html
