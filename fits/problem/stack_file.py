@@ -17,7 +17,6 @@ import math
 import tomllib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields
-from numbers import Real
 from pathlib import Path
 from typing import Any, Literal, cast, get_args
 
@@ -134,7 +133,8 @@ def write_problem(
     require_material(stack)
     require_kind("transport", transport, lj.Transport, str)
     require_kind("noise", noise, Noise, None)
-    require_kind("scale", scale, Real, Free, None)
+    if not (scale is None or isinstance(scale, Free)):
+        require_number("scale", scale, 0.0, open_ends=True)
     require_kind("instrument", instrument, Instrument, None)
     choice("objective", objective, get_args(Objective))
     tables = {"transport": transport_to_dict(transport), "objective": objective}
