@@ -93,6 +93,7 @@ def main(times: int = 10, where: str | None = None) -> int:
             begun = time.monotonic()
             code = run(whole, words).wait()
             seconds, expected = time.monotonic() - begun, result(whole, name)
+            assert expected, (whole / "log.txt").read_text()  # else all would be the same
             done = 0
             while done < times:
                 shutil.copytree(inputs, killed)
