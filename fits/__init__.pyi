@@ -31,8 +31,8 @@ from fits.prediction.compare import average as average
 from fits.prediction.compare import compare as compare
 from fits.prediction.cross_validation import ModelScore as ModelScore
 from fits.prediction.cross_validation import cross_validate as cross_validate
-from fits.prediction.importance import Evidence as Evidence
-from fits.prediction.importance import evidence as evidence
+from fits.prediction.evidence import Evidence as Evidence
+from fits.prediction.evidence import evidence as evidence
 from fits.prediction.options import ComparisonOptions as ComparisonOptions
 from fits.prediction.predict import Prediction as Prediction
 from fits.prediction.predict import Scores as Scores

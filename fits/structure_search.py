@@ -26,7 +26,7 @@ from fits.optimise.options import DEFAULT, FitOptions
 from fits.optimise.result import Fit
 from fits.prediction.compare import ComparedFit, Comparison
 from fits.prediction.cross_validation import CrossValidation, ModelScore, out_of_sample, rank_models
-from fits.prediction.importance import Evidence
+from fits.prediction.evidence import Evidence
 from fits.prediction.options import ComparisonOptions
 from fits.problem.compilation import cores, make_room
 from fits.problem.instrument import Instrument

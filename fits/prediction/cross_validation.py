@@ -17,13 +17,14 @@ from fits.data.geometry import Floats
 from fits.data.scans import incidences, scans
 from fits.optimise.fit import refit
 from fits.optimise.result import Fit
-from fits.prediction.importance import Evidence, ImportanceDraws, posterior_draws
+from fits.prediction.evidence import Evidence, evidence_of, posterior_draws
 from fits.prediction.options import DEFAULT, ComparisonOptions
 from fits.prediction.predict import posterior_predictive
 from fits.problem.discrepancy import size
 from fits.problem.problem import Problem
 from fits.progress import Progress, given_progress, named
 from fits.sampling.initial import other_minima
+from fits.sampling.mixture import Mixture
 from layerjax._checks import require_count, require_kind, require_seed
 from layerjax.compiling import programs_kept
 
@@ -72,7 +73,7 @@ def cross_validate(
     seed: int = 0,
     options: ComparisonOptions | None = None,
     progress: Progress | None = None,
-    posterior: ImportanceDraws | None = None,
+    initial: Mixture | None = None,
 ) -> CrossValidation:
     """Fit again without each incidence, starting from the best values, and predict its measurements.
 
@@ -84,7 +85,7 @@ def cross_validate(
         seed: see `predict`.
         options: `min_incidences` and `scan_parts` decide what is held out together.
         progress: called with ("cross-validation", groups done, groups, name).
-        posterior: draws of the fit's posterior; those without a group are sought about them.
+        initial: approximation of the fit's posterior, from which those without a group are sought.
 
     Raises:
         ValueError: a fit of a named objective, data of a single group, or a joint fit or a part of one.
@@ -93,14 +94,13 @@ def cross_validate(
     require_seed(seed)
     progress, options = given_progress(progress), options or DEFAULT
     groups, data = require_groups(fit, options), fit.problem.data.used()
-    proposal = None if posterior is None else posterior.proposal(np.random.RandomState(seed), 2 * draws)
     density, errors, converged = np.zeros(data.values.shape), np.zeros(len(groups)), True
     for number, (name, rows) in enumerate(groups.items()):
         progress("cross-validation", number, len(groups), name)
         rest = refit(without(fit.problem, np.isin(np.arange(len(data)), rows)), fit.vector, *other_minima(fit))
         each, effective, error = np.empty((0, *data.values[rows].shape)), 0.0, math.inf
         while not len(each) or (error > options.monte_carlo_error and len(each) < options.most_draws):
-            prediction = posterior_predictive(rest, data, draws=draws, seed=seed + len(each), proposal=proposal)
+            prediction = posterior_predictive(rest, data, draws=draws, seed=seed + len(each), initial=initial)
             each = np.concatenate([each, prediction.log_densities(data.values)[:, rows]])
             effective += prediction.effective_draws
             density[rows] = logsumexp(each, axis=0) - math.log(len(each))
@@ -189,8 +189,8 @@ def out_of_sample(
     """Cross-validation and evidence of a fit, both by draws of its posterior."""
     require_groups(fit, options)
     draws = posterior_draws(fit)
-    held_out = cross_validate(fit, options=options, progress=progress, posterior=draws)
-    return held_out, draws.evidence
+    held_out = cross_validate(fit, options=options, progress=progress, initial=draws.mixture)
+    return held_out, evidence_of(draws)
 
 
 def rank_models(

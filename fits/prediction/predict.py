@@ -23,16 +23,16 @@ from fits.data.geometry import Floats, Geometry
 from fits.data.measurements import TO_HAVE_THEM, Measurements
 from fits.data.totals import Totals
 from fits.optimise.result import Fit
-from fits.prediction.importance import MAX_PARETO_K, importance_draws
 from fits.problem.discrepancy import logarithm, places, size
 from fits.problem.discrepancy import softness as softness_of
 from fits.problem.instrument import gain_unknown
 from fits.problem.model import Model
 from fits.problem.problem import polar_angles
 from fits.problem.simulate import require_visible
+from fits.sampling.importance import MAX_PARETO_K, importance_draws
 from fits.sampling.initial import normal_draws
+from fits.sampling.mixture import Mixture
 from fits.sampling.posterior import Posterior
-from fits.sampling.proposals import Density
 from layerjax._checks import in_short, require_count, require_kind, require_number, require_seed
 from layerjax.compiling import programs_kept
 
@@ -274,9 +274,9 @@ def predict(
 
 
 def posterior_predictive(
-    fitted: Fit | Posterior, at: Geometry | Measurements, *, draws: int, seed: int, proposal: Density | None = None
+    fitted: Fit | Posterior, at: Geometry | Measurements, *, draws: int, seed: int, initial: Mixture | None = None
 ) -> Prediction:
-    """`predict` for one fit; proposal: an approximation of its posterior (see `importance_draws`), if there is one."""
+    """`predict` for one fit; initial: an approximation of its posterior (see `importance_draws`), if there is one."""
     fit = fitted.fit if isinstance(fitted, Posterior) else fitted
     fit.require_one("predict")
     if not fit.is_posterior:
@@ -305,7 +305,7 @@ def posterior_predictive(
             positions = normal_draws(fit, draws, random)
         else:
             pool = max(MIN_PROPOSALS, 2 * draws)
-            weighted = importance_draws(fit, pool, random, max_pareto_k=MAX_PARETO_K, proposal=proposal)
+            weighted = importance_draws(fit, pool, random, max_pareto_k=MAX_PARETO_K, initial=initial)
             positions, pareto_k = weighted.resample(random, draws), weighted.pareto_k
             effective = _resampled_size(draws, weighted.effective_sample_size)
         vectors = np.asarray(jax.vmap(problem.model.box.constrain)(jnp.asarray(positions)), float)

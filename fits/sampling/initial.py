@@ -1,8 +1,7 @@
-"""Where chains begin: Laplace's approximations of the posterior about the minima of a fit, and along their ridges.
+"""Laplace's approximations of a posterior about the minima of a fit, and the posterior itself at many points.
 
 A parameter at a bound lies at an exponentially distributed distance from it, by the slope of the posterior there; the
-others follow the information at the minimum. Where a direction is unidentified, the approximation follows the
-ridge, however it bends.
+others follow the information at the minimum.
 """
 
 from collections.abc import Callable
@@ -18,17 +17,17 @@ from scipy.special import logit, logsumexp
 from fits.data.geometry import Floats
 from fits.optimise.multi_start import least_squares_descent, unit_of
 from fits.optimise.result import Fit
-from fits.optimise.uncertainty import local_information, uncertainty
+from fits.optimise.uncertainty import local_information, square, uncertainty
 from fits.problem.compilation import cores, in_shares
 from fits.problem.model import Model
 from fits.problem.problem import FittingProblem, Problem
 from fits.sampling.mixture import NARROWEST, Mixture
 from fits.sampling.options import SamplerOptions
-from fits.sampling.ridge import Ridge, open_directions, ridge
 
 WIDEST = 2.0  # in log-odds, where a uniform density over the box has a standard deviation of 1.8
 WIDEST_IN_BOX = 0.3
 INSIDE = 1e-9  # of the box
+OPEN = 0.1  # boxes: a direction in which the posterior is wider is open
 OPEN_SHARE = 0.01  # of the squared length of an open direction: a parameter at a bound that has more lies along it,
 PRESSED = 10.0  # unless the log-posterior falls by more than this from the bound across the box
 APART = 3.0  # standard deviations: minima that are closer are one mode
@@ -36,63 +35,53 @@ MOST_MODES = 8
 LOWEST_MINIMUM = 8.0  # in the log-posterior, below the best: what lies lower holds next to nothing, however broad it is
 
 
-def initial_mixture(
-    fit: Fit, share: int, smallest_mode: float = SamplerOptions.smallest_mode, *, along_ridges: bool = True
-) -> Mixture:
-    """About those minima of a fit that hold a share of its posterior, each a mode; share: see `log_posteriors`.
-
-    along_ridges: which takes some hundred Jacobians where a direction is unidentified.
-    """
+def initial_mixture(fit: Fit, share: int, smallest_mode: float = SamplerOptions.smallest_mode) -> Mixture:
+    """About those minima of a fit that hold a share of its posterior, each a mode; share: see `log_posteriors`."""
     problem = fit.problem
-    found = [_about(problem, fit.vector, np.isin(problem.names, fit.at_bound), share, along_ridges)]
+    found = [_about(problem, fit.vector, np.isin(problem.names, fit.at_bound), share)]
     for vector in other_minima(fit):
         end = least_squares_descent(problem, unit_of(problem, vector), fresh=False)
         position = logit(np.clip(unit_of(problem, end.vector), INSIDE, 1.0 - INSIDE))[None]
         near = any(np.min(one.squared_distance(position)) < APART**2 for one in found)
         if near or end.cost >= fit.cost + LOWEST_MINIMUM:
             continue
-        at_bound = uncertainty(problem, end.vector, end.cost).at_bound
-        found.append(_about(problem, end.vector, at_bound, share, along_ridges))
+        found.append(_about(problem, end.vector, uncertainty(problem, end.vector, end.cost).at_bound, share))
     mass = np.array([logsumexp(one.log_weight) for one in found])
     kept = [one for one, its in zip(found, mass, strict=True) if its > np.max(mass) + np.log(smallest_mode)]
     return Mixture.of_modes(kept)
 
 
-def _about(problem: Problem, vector: Floats, at_bound: NDArray[np.bool_], share: int, along_ridges: bool) -> Mixture:
-    """About the points of the ridge of a minimum (P,), or that alone; weights are logarithms of masses of posterior.
+def _about(problem: Problem, vector: Floats, at_bound: NDArray[np.bool_], share: int) -> Mixture:
+    """About a minimum (P,), by the information there; its weight is the logarithm of its mass of posterior.
 
-    By the information at the minimum: where a direction is unidentified, the covariance of a fit has lost the others.
+    Where a direction is unidentified, the covariance of a fit has lost the others.
     """
     unit = unit_of(problem, vector)
     rows, gradient, _ = local_information(problem, unit)
     if at_bound.any():
         along = np.sum(open_directions(rows) ** 2, axis=0)
         at_bound = at_bound & ((along < OPEN_SHARE) | (np.abs(gradient) > PRESSED))
-    alone = Ridge(unit[None], rows[None], np.zeros((1, 0, len(unit))))
-    found = ridge(problem, unit, ~at_bound) if along_ridges else alone
-    information = np.concatenate([found.rows, found.bounds], axis=1)
     # no closer to a bound than half a deviation, that of the others given: there is no slope in log-odds next to it
-    within = np.minimum(0.5 / np.maximum(np.linalg.norm(information, axis=1), 0.5 / WIDEST_IN_BOX), 0.5)
+    within = np.minimum(0.5 / np.maximum(np.linalg.norm(rows, axis=0), 0.5 / WIDEST_IN_BOX), 0.5)
     within = np.where(at_bound, INSIDE, within)
-    points = np.clip(found.points, within, 1.0 - within)
-    free, count = np.flatnonzero(~at_bound), len(points)
-    in_log_odds = (information * (points * (1.0 - points))[:, None])[..., free]
-    widest = np.tile(np.eye(len(free)) / WIDEST, (count, 1, 1))
-    _, values, directions = np.linalg.svd(np.concatenate([in_log_odds, widest], axis=1), full_matrices=False)
-    root = np.zeros((count, len(vector), len(vector)))
-    root[:, free[:, None], free] = np.swapaxes(directions, 1, 2) / values[:, None]
-    distance = np.clip(1.0 / np.maximum(np.abs(gradient), INSIDE), INSIDE, WIDEST_IN_BOX)
-    mixture = Mixture(
-        centre=logit(points),
-        root=root,
-        at_bound=np.tile(at_bound, (count, 1)),
-        distance=np.tile(distance, (count, 1)),
-        log_weight=np.zeros(count),
-        mode=np.zeros(count, int),
+    point = np.clip(unit, within, 1.0 - within)
+    free, count = np.flatnonzero(~at_bound), len(vector)
+    in_log_odds = (rows * (point * (1.0 - point)))[:, free]
+    _, values, directions = np.linalg.svd(
+        np.concatenate([in_log_odds, np.eye(len(free)) / WIDEST]), full_matrices=False
     )
-    log_posterior_there = log_posteriors(problem, mixture.centre, share)
-    own = np.diagonal(mixture.log_parts(mixture.centre))
-    return replace(mixture, log_weight=np.where(np.isfinite(log_posterior_there), log_posterior_there, -np.inf) - own)
+    root = np.zeros((count, count))
+    root[np.ix_(free, free)] = directions.T / values
+    distance = np.clip(1.0 / np.maximum(np.abs(gradient), INSIDE), INSIDE, WIDEST_IN_BOX)
+    found = Mixture(logit(point)[None], root[None], at_bound[None], distance[None], np.zeros(1), np.zeros(1, int))
+    height = log_posteriors(problem, found.centre, share) - found.log_density(found.centre)
+    return replace(found, log_weight=np.where(np.isfinite(height), height, -np.inf))
+
+
+def open_directions(rows: Floats) -> Floats:
+    """Directions in the box, (number, F), in which a posterior with these rows of information (R, F) is wide."""
+    _, values, directions = np.linalg.svd(square(rows))
+    return directions[values * OPEN < 1.0]
 
 
 def normal_draws(fit: Fit, count: int, generator: np.random.RandomState) -> Floats:

@@ -1,4 +1,4 @@
-"""A mixture of heavy-tailed densities: about the minima of a fit (`initial`), or fitted to draws (`proposals`)."""
+"""A mixture of heavy-tailed densities, which approximates a posterior: see `initial` and `importance`."""
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
@@ -8,16 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
-from scipy.cluster.vq import ClusterError, kmeans2
 from scipy.special import expit, gammaln, logit, logsumexp
 
 from fits.data.geometry import Floats
 
-DEGREES_OF_FREEDOM = 6.0
-COMPONENTS = 4  # of mixtures that are fitted to draws: more follow what is there by chance
-ITERATIONS = 10
-MOST_SAMPLES = 8000
-SMALLEST_VARIANCE = 1e-12  # of a unit, that a combination of parameters keeps
+DEGREES_OF_FREEDOM = 3.0  # tails heavier than those of a posterior: where they are lighter, walkers stay
 NARROWEST, INSIDE = 1e-9, 1e-9  # in log-odds; of the box
 
 
@@ -50,30 +45,11 @@ class Mixture:
         mode = np.repeat(np.arange(len(parts)), [len(part.centre) for part in parts])
         return replace(joined, mode=mode, log_weight=joined.log_weight - logsumexp(joined.log_weight))
 
-    @classmethod
-    def fitted(cls, positions: Floats, generator: np.random.RandomState) -> "Mixture":
-        """Fitted to samples (count, P), two at least, by expectation and maximisation; each component counts as a few
-        samples of its own, so that it keeps its full rank."""
-        samples = positions[generator.permutation(len(positions))[:MOST_SAMPLES]]  # of all walkers
-        dimension = samples.shape[1]
-        values, directions = np.linalg.eigh(np.atleast_2d(np.cov(samples.T)))
-        whole = directions * np.sqrt(np.maximum(values, NARROWEST**2))
-        white = np.linalg.solve(whole, samples.T).T
-        centres, nearest = _clusters(white, generator)
-        prior = whole @ np.atleast_2d(np.cov((white - centres[nearest]).T)) @ whole.T
-        count, own = len(centres), 2.0 + dimension
-        now = cls.students(centres @ whole.T, np.tile(_root(prior), (count, 1, 1)), np.full(count, -np.log(count)))
-        for _ in range(ITERATIONS):
-            parts = now.log_parts(samples)
-            share = np.exp(parts - logsumexp(parts, axis=0))
-            near = share * (DEGREES_OF_FREEDOM + dimension) / (DEGREES_OF_FREEDOM + now.squared_distance(samples))
-            centre = (near @ samples + own * now.centre) / (near.sum(axis=1) + own)[:, None]
-            away = samples - centre[:, None]
-            scatter = np.swapaxes(away * near[..., None], 1, 2) @ away
-            scale = (scatter + own * prior) / (share.sum(axis=1) + own)[:, None, None]
-            weight = share.sum(axis=1) + 1.0
-            now = cls.students(centre, _root(scale), np.log(weight / weight.sum()))
-        return now
+    def extended(self, added: "Mixture", share: float) -> "Mixture":
+        """With another mixture, which is drawn from so often; its components belong to the modes that they lie in."""
+        added = replace(added, log_weight=added.log_weight + np.log(share), mode=self.mode_of(added.centre))
+        own = replace(self, log_weight=self.log_weight + np.log1p(-share))
+        return Mixture(*(np.concatenate([vars(own)[name], vars(added)[name]]) for name in self.__dataclass_fields__))
 
     @property
     def best(self) -> "Mixture":
@@ -141,24 +117,3 @@ class Mixture:
     def record(self) -> dict[str, Any]:
         """Its arrays by name, as a store keeps them."""
         return {name: np.ascontiguousarray(array) for name, array in asdict(self).items()}
-
-
-def _clusters(points: Floats, generator: np.random.RandomState) -> tuple[Floats, NDArray[np.int_]]:
-    """Centres of up to `COMPONENTS` clusters, none of them empty, and which one each point belongs to."""
-    for count in range(min(COMPONENTS, len(np.unique(points.round(6), axis=0))), 1, -1):
-        try:
-            return kmeans2(points, count, minit="++", missing="raise", rng=generator)
-        except ClusterError:
-            continue
-    return points.mean(axis=0, keepdims=True), np.zeros(len(points), int)
-
-
-def _root(covariance: Floats) -> Floats:
-    """Roots (..., P, P) of covariances, of full rank however little rounding has left of them."""
-    variance = np.diagonal(covariance, axis1=-2, axis2=-1)
-    scale = np.sqrt(np.maximum(variance, NARROWEST**2))
-    scaled = covariance / (scale[..., None] * scale[..., None, :])
-    short = 1.0 - variance / scale**2  # of a unit, where there is next to no variance
-    return scale[..., None] * np.linalg.cholesky(
-        scaled + (short + SMALLEST_VARIANCE)[..., None] * np.eye(scaled.shape[-1])
-    )

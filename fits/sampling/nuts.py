@@ -20,14 +20,12 @@ from fits.problem.compilation import cores, in_shares
 from fits.problem.model import Model
 from fits.progress import Progress
 from fits.sampling.chain import Chain
-from fits.sampling.ensemble import FITS, proposals_of
-from fits.sampling.initial import first_positions, initial_mixture, log_posteriors, share_of
+from fits.sampling.ensemble import first_mixture, propose
+from fits.sampling.initial import first_positions, log_posteriors, share_of
 from fits.sampling.mixture import Mixture
 from fits.sampling.options import SamplerOptions
-from fits.sampling.proposals import propose
 
 CHAINS = 4
-FEWEST = 1000  # draws that proposals are fitted to: on a ridge those of fewer, by few chains, are worse than the first
 DRAWS = 4096  # of the approximation, for its covariance
 
 
@@ -46,30 +44,29 @@ class Nuts:
         self.problem, self.chain, self.seed = fit.problem, chain, seed
         self._compiled: set[Callable[..., Any]] = set()
         if not chain.moves:
-            self._warm_up(initial_mixture(fit, share_of(chain.shape[0]), options.smallest_mode), options, progress)
+            self._warm_up(first_mixture(fit, seed, share_of(chain.shape[0]), options), options, progress)
 
-    def _warm_up(self, initial: Mixture, options: SamplerOptions, progress: Progress) -> None:
+    def _warm_up(self, mixture: Mixture, options: SamplerOptions, progress: Progress) -> None:
         """Before the first step, and for all: where each chain begins, its metric, and the length of its steps."""
         generator = np.random.RandomState(self.seed)
-        metric = np.atleast_2d(np.cov(initial.best.draw(generator, DRAWS).T))
-        positions = first_positions(initial, self._log_posteriors, self.chain.shape[0], generator)
+        metric = np.atleast_2d(np.cov(mixture.best.draw(generator, DRAWS).T))
+        positions = first_positions(mixture, self._log_posteriors, self.chain.shape[0], generator)
         progress("warm-up", 0, None, f"{options.warm_up} steps of each of {len(positions)} chains")
         adapt = _adaptation(options.warm_up, options.target_acceptance)
         positions, step_sizes, metrics = self._on_all_cores(adapt, positions, metric=metric)
         progress("warm-up", options.warm_up, options.warm_up)
-        moves = {"initial": initial.record(), "positions": positions, "step_sizes": step_sizes, "metrics": metrics}
+        moves = {"mixture": mixture.record(), "positions": positions, "step_sizes": step_sizes, "metrics": metrics}
         self.chain.decide(moves)
 
     def advance(self, step: int, show: Callable[[], None]) -> None:
         """Append steps to the chain until it has `step` of them, and `show` each."""
-        chain, moves, proposals = self.chain, self.chain.moves, proposals_of(self.chain, FEWEST)
+        chain, moves = self.chain, self.chain.moves
+        mixture = Mixture(**moves["mixture"])
         positions = chain.get_last_sample().coords if chain.iteration else moves["positions"]
         chain.grow(step - chain.iteration, None)
         while chain.iteration < step:
-            if chain.iteration in FITS:
-                proposals = proposals_of(chain, FEWEST)
             generator = np.random.RandomState([self.seed, chain.iteration])
-            drawn, log_ratio = propose(proposals, positions, generator)
+            drawn, log_ratio = propose(mixture, positions, generator)
             gain = log_ratio + self._log_posteriors(drawn) - self._log_posteriors(positions)
             positions = np.where((np.log(generator.random_sample(len(drawn))) < gain)[:, None], drawn, positions)
             positions, log_posterior, divergent = self._on_all_cores(

@@ -18,8 +18,8 @@ class SamplerOptions:
         walkers: of emcee, even, at least 2 P + 2 for P parameters (None: 32, or 2 P + 2), or chains of NUTS, at least 2
             (None: 4).
         burn_in: share of the chain, at its start, that no estimate uses.
-        independent: share of emcee's proposals that are drawn from the fitted mixture; the others depend on where
-            walkers stand.
+        independent: share of emcee's proposals that are drawn from a mixture that approximates the posterior; the
+            others depend on where walkers stand.
         warm_up: steps of each chain of NUTS before its first draw, which find its metric and step size.
         target_acceptance: mean acceptance that the step size of NUTS is adapted to; higher, it follows narrower curved
             posteriors.
@@ -33,7 +33,7 @@ class SamplerOptions:
     max_steps: int = 20_000
     walkers: int | None = None
     burn_in: float = 0.1
-    independent: float = 0.5
+    independent: float = 0.8
     warm_up: int = 300
     target_acceptance: float = 0.9
     smallest_mode: float = 0.005

@@ -203,7 +203,7 @@ def posterior_of(fit: Fit, chain: Chain, allow_unconverged: bool = False) -> Pos
         allow_unconverged=allow_unconverged,
         status=status,
         divergences=divergences,
-        modes=_modes(fit, Mixture(**chain.moves["initial"]), positions, values, options),
+        modes=_modes(fit, Mixture(**chain.moves["mixture"]), positions, values, options),
         options=options,
     )
 

@@ -10,10 +10,9 @@ from scipy.special import logsumexp
 
 from fits import ComparisonOptions, Fit, Measurements, Noise, Problem, average, compare, fit, predict, slices
 from fits.prediction.cross_validation import CrossValidation, cross_validate, rank_models, stacking, without
-from fits.prediction.importance import Evidence, evidence, posterior_draws
+from fits.prediction.evidence import Evidence, evidence, posterior_draws
 from fits.problem.parameters import Free, LogUniform, Normal
 from fits.reports import tables
-from fits.sampling import initial
 from tests.helpers.models import along, line
 
 SIGMA = 0.05
@@ -93,15 +92,12 @@ def test_errors_by_few_draws_are_told(found: Fit) -> None:
 
 
 @pytest.mark.parametrize("known", [False, True])
-def test_held_out_data_of_a_ridge_are_predicted(known: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_held_out_data_of_a_ridge_are_predicted(known: bool) -> None:
     """Only the product of a level and a scale is identified; draws of the whole posterior follow the ridge."""
     level = replace(DATA, values=1.0 + DATA.values - EXACT)
     ridge_fit = fitted({"a": Free(0.5, 0.0, 1.0), "b": 0.0}, level, scale=Free(1.0, 0.1, 10.0, LogUniform()))
-    draws = posterior_draws(ridge_fit) if known else None
-    followed: list[Any] = []
-    monkeypatch.setattr(initial, "ridge", lambda *given, ridge=initial.ridge: followed.append(given) or ridge(*given))
-    left = cross_validate(ridge_fit, draws=2000, posterior=draws)
-    assert len(followed) == (0 if known else 3)
+    initial = posterior_draws(ridge_fit).mixture if known else None
+    left = cross_validate(ridge_fit, draws=2000, initial=initial)
     for rows in left.rows:
         others = np.setdiff1d(np.arange(len(level)), rows)
         values, width = level.values[:, 0], SIGMA * np.sqrt(1.0 + 1.0 / len(others))

@@ -10,11 +10,11 @@ from scipy import special, stats
 
 import fits
 from fits import Fit, Free, Normal, Posterior, SamplerOptions, Uniform, fit, sample
-from fits.prediction.importance import importance_draws
 from fits.problem.parameters import Prior
 from fits.reports import verdicts
 from fits.reports.tables import parameter_table, posterior_table
 from fits.sampling.convergence import Convergence
+from fits.sampling.importance import importance_draws
 from fits.sampling.initial import initial_mixture
 from fits.sampling.sample import Sampler, load
 from tests.helpers.models import COUNT, design, measured
