@@ -57,8 +57,8 @@ class Ensemble:
                 show()
 
     def _mixture(self) -> Mixture:
-        """What proposals are drawn from, after some steps with more components: where the posterior exceeds it most of all
-        places that walkers have been to since the last ones were added. As that grows rare, adaptation fades."""
+        """What proposals are drawn from, after some steps with more components: where the posterior exceeds it most
+        among all places that walkers have been to since the last ones were added. So adaptation fades."""
         chain, mixture, since = self.chain, Mixture(**self.chain.moves["mixture"]), self.chain.moves["steps"]
         if since == chain.iteration or chain.iteration not in ADDED_AFTER:
             return mixture
