@@ -14,6 +14,7 @@ import numpy as np
 from fits.data.geometry import Floats
 from fits.optimise.result import Fit
 from fits.problem.compilation import one_thread
+from fits.progress import Progress
 from fits.sampling.chain import Chain
 from fits.sampling.importance import COMPONENTS, components_at, importance_draws
 from fits.sampling.initial import first_positions, log_posteriors, share_of
@@ -31,11 +32,11 @@ EFFICIENCY = 0.4  # effective draws of it to draws, at which it needs no more co
 class Ensemble:
     """Moves the walkers of a chain about the optimum of a fit."""
 
-    def __init__(self, fit: Fit, chain: Chain, seed: int, options: SamplerOptions):
+    def __init__(self, fit: Fit, chain: Chain, seed: int, options: SamplerOptions, progress: Progress):
         self.problem, self.chain, self.seed, self.options = fit.problem, chain, seed, options
         self.share, self._compiled = share_of(chain.shape[0]), False
         if not chain.moves:
-            chain.decide({"mixture": first_mixture(fit, seed, self.share, options).record(), "steps": 0})
+            chain.decide({"mixture": first_mixture(fit, seed, options, progress, self.share).record(), "steps": 0})
 
     def advance(self, step: int, show: Callable[[], None]) -> None:
         """Append steps to the chain until it has `step` of them, and `show` each."""
@@ -85,7 +86,7 @@ class Ensemble:
         return emcee.State(positions, random_state=generator.get_state())  # else emcee copies numpy's global state
 
 
-def first_mixture(fit: Fit, seed: int, share: int, options: SamplerOptions) -> Mixture:
+def first_mixture(fit: Fit, seed: int, options: SamplerOptions, progress: Progress, share: int) -> Mixture:
     """What a chain begins with: an approximation of the posterior that is efficient, or as good as it gets."""
     draws = importance_draws(
         fit,
@@ -94,6 +95,7 @@ def first_mixture(fit: Fit, seed: int, share: int, options: SamplerOptions) -> M
         efficiency=EFFICIENCY,
         share=share,
         smallest_mode=options.smallest_mode,
+        progress=progress,
     )
     return draws.mixture
 

@@ -18,13 +18,15 @@ from fits.optimise.result import Fit
 from fits.optimise.uncertainty import local_information
 from fits.problem.compilation import on_all_cores, one_thread
 from fits.problem.problem import Problem
+from fits.progress import Progress, silent
 from fits.sampling.initial import initial_mixture, log_posteriors
-from fits.sampling.mixture import Mixture
+from fits.sampling.mixture import NARROWEST, Mixture
 from fits.sampling.options import SamplerOptions
 
 MAX_PARETO_K = 0.7  # above it a part of the posterior may be missing
 FINITE_VARIANCE = 0.5  # Pareto k below which the variance of weights is finite
 MIN_EFFECTIVE_DRAWS = 50
+FEWEST = 200  # draws, of whose spread something can be said
 MIN_EFFICIENCY = 0.2  # effective draws to draws: with less, a part of a ridge may not have been reached
 SHARE = 8  # draws that a core evaluates at a time: however many there are, one program serves
 ROUNDS = 16
@@ -32,6 +34,7 @@ ROUNDS_ALONG_RIDGES = 8  # at least, where a direction is unidentified: of a sho
 COMPONENTS = 8  # that each round adds
 DRAWS = 32  # of each of them
 WIDEST = 2.0  # standard deviations of the posterior, as far as it is known: no component is wider
+SMALLEST_VARIANCE = 1e-6  # of the largest, of a combination of parameters as far as it is known
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,16 +75,17 @@ def importance_draws(
     share: int = SHARE,
     smallest_mode: float = SamplerOptions.smallest_mode,
     initial: Mixture | None = None,
+    progress: Progress = silent,
 ) -> ImportanceDraws:
-    """So many draws, and more until they suffice: with a Pareto k below this, enough effective draws, and at least
-    this share of all.
+    """So many draws, 200 at least, and more until they suffice: with a Pareto k below this, enough effective draws, and
+    at least this share of all.
 
     The fit is of a likelihood. share: see `log_posteriors`. initial: mixture that is drawn from first, in place of
-    approximations about the minima of the fit.
+    approximations about the minima of the fit. progress: called with ("approximation", rounds, the most, note).
     """
     problem, fewest = fit.problem, ROUNDS_ALONG_RIDGES if fit.unidentified and initial is None else 0
     mixture = initial or initial_mixture(fit, share, smallest_mode)
-    positions = mixture.draw(generator, draws)
+    positions = mixture.draw(generator, max(draws, FEWEST))
     heights, log_density = log_posteriors(problem, positions, share), mixture.log_density(positions)
     for number in range(ROUNDS + 1):
         weights = np.where(np.isfinite(heights), heights - log_density, -np.inf)
@@ -90,6 +94,7 @@ def importance_draws(
         suffices = found.pareto_k < max_pareto_k and found.effective_sample_size >= enough
         if (suffices and number >= fewest) or number == ROUNDS or not np.isfinite(weights).any():
             break
+        progress("approximation", number, ROUNDS, f"{found.effective_sample_size / len(positions):.0%} efficient")
         even = _tempered(weights)
         spread = np.atleast_2d(np.cov(positions.T, aweights=np.exp(even - even.max()), ddof=0))
         top = np.argsort(-weights)[:COMPONENTS]
@@ -110,13 +115,13 @@ def components_at(problem: Problem, positions: Floats, spread: Floats) -> Mixtur
     """A component of equal weight for each of `positions` (M, P), by the information there, and a step of at most one
     standard deviation up the posterior; none is much wider than a posterior of covariance `spread`, (P, P)."""
     values, directions = np.linalg.eigh(spread)
-    bound = np.maximum(values, 1e-6 * values[-1])
+    bound = np.maximum(values, max(SMALLEST_VARIANCE * values[-1], NARROWEST**2))
     limit = (directions / bound) @ directions.T / WIDEST**2
 
     def about(position: Floats) -> tuple[Floats, Floats]:
         unit = expit(position)
         stretch = unit * (1.0 - unit)
-        rows, slope, _ = local_information(problem, unit)
+        rows, slope = (np.nan_to_num(part, posinf=0.0, neginf=0.0) for part in local_information(problem, unit)[:2])
         precision = (rows * stretch).T @ (rows * stretch) + np.diag(2.0 * stretch) + limit
         with one_thread():  # the same to the last bit, whatever else runs
             values, directions = np.linalg.eigh(precision)

@@ -44,7 +44,7 @@ class Nuts:
         self.problem, self.chain, self.seed = fit.problem, chain, seed
         self._compiled: set[Callable[..., Any]] = set()
         if not chain.moves:
-            self._warm_up(first_mixture(fit, seed, share_of(chain.shape[0]), options), options, progress)
+            self._warm_up(first_mixture(fit, seed, options, progress, share_of(chain.shape[0])), options, progress)
 
     def _warm_up(self, mixture: Mixture, options: SamplerOptions, progress: Progress) -> None:
         """Before the first step, and for all: where each chain begins, its metric, and the length of its steps."""

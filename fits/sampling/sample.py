@@ -59,8 +59,8 @@ def sample(
             would have. One process at a time writes it, any number may read it. None keeps it in memory.
         resume: False replaces what `path` holds.
         allow_unconverged: let the result report estimates though the chain has not converged.
-        progress: called with ("sample", steps, steps that are expected in all, note); of NUTS, before that with
-            ("warm-up", steps, all).
+        progress: called with ("sample", steps, steps that are expected in all, note); before that with
+            ("approximation", rounds, most, note), and of NUTS with ("warm-up", steps, all).
 
     Raises:
         ValueError: the fit's objective is no likelihood, or it is a part of a joint one, whose chain is that of the
@@ -84,7 +84,7 @@ def sample(
     progress = given_progress(progress)
     with opened(path, walkers, count, identity_of(fit.problem, walkers, seed, sampler), resume) as chain:
         chain.keep_options(asdict(options))
-        moved = Nuts(fit, chain, seed, options, progress) if sampler == "nuts" else Ensemble(fit, chain, seed, options)
+        moved = (Nuts if sampler == "nuts" else Ensemble)(fit, chain, seed, options, progress)
         _run(moved, chain, options, progress)
     return posterior_of(fit, chain, allow_unconverged)
 

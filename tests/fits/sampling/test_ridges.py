@@ -1,4 +1,5 @@
-"""Posteriors that the data leave open along a ridge: sampled from any seed, with marginals known by integration."""
+"""Posteriors that the data leave open along a ridge: sampled from any seed, with marginals known by integration; and
+the mixtures that follow them."""
 
 import jax
 import jax.numpy as jnp
@@ -8,6 +9,8 @@ from scipy import stats
 
 import layerjax as lj
 from fits import Free, LogUniform, fit, sample
+from fits.sampling import importance
+from fits.sampling.importance import components_at, importance_draws
 from tests.helpers.models import directions, measured
 
 COUNT, SIGMA, LEVEL = 40, 0.005, 0.5
@@ -82,3 +85,18 @@ def test_haze_and_albedo_times_scale(seed):
         below = np.cumsum(density.sum(axis=axis))
         below /= below[-1]
         assert_quantiles(posterior, np.interp(SHARES, below, grid + 0.5 * (grid[1] - grid[0])), name)
+
+
+def test_a_mixture_grows_from_any_draws() -> None:
+    """From two draws, and where the information has no finite values: the spread of the draws takes its place."""
+    fitted = fit(PAINT, paint(0), scale=SCALE, transport=lj.SingleScattering(), starts=2)
+    draws = importance_draws(fitted, 2, np.random.RandomState(0))
+    assert draws.effective_sample_size > 300
+    where = draws.mixture.centre[-3:]
+    np.testing.assert_array_equal(components_at(fitted.problem, where, np.zeros((2, 2))).centre.shape, (3, 2))
+    with pytest.MonkeyPatch.context() as patch:
+        rows = np.full((COUNT, 2), np.nan)
+        patch.setattr(importance, "local_information", lambda problem, unit: (rows, np.full(2, np.inf), 0.0))
+        blind = components_at(fitted.problem, where, np.diag([1.0, 4.0]))
+    assert np.isfinite(blind.log_density(where)).all()
+    assert np.all(blind.root @ np.swapaxes(blind.root, 1, 2) <= 4.0 * np.diag([1.0, 4.0]) + 1e-12)
