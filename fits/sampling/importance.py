@@ -1,11 +1,11 @@
 """Importance sampling of the posterior of a fit: weighted draws without a chain, and the mixture they are drawn from.
 
-Incremental mixture importance sampling (Raftery & Bao 2010, Biometrics 66, 1162): the first draws are those of Laplace's
-approximations about the minima of the fit. Where their weights, posterior / mixture, are largest the mixture has too
-little: components are added there, by the information at each place (as of Fasiolo, de Melo & Maskell 2018, Stat. Comput.
-28, 549), and drawn from. All draws are weighted as those of the whole mixture. So it grows along ridges, however they
-bend. The Pareto k of the largest weights says how well the draws represent the posterior (Vehtari, Simpson, Gelman, Yao
-& Gabry 2024, JMLR 25, 72).
+Incremental mixture importance sampling (Raftery & Bao 2010, Biometrics 66, 1162): the first draws are those of
+Laplace's approximations about the minima of the fit. Where their weights, posterior / mixture, are largest the mixture
+has too little: components are added there, by the information at each place (as of Fasiolo, de Melo & Maskell 2018,
+Stat. Comput. 28, 549), and drawn from. All draws are weighted as those of the whole mixture. So it grows along ridges,
+however they bend. The Pareto k of the largest weights says how well the draws represent the posterior (Vehtari, Simpson,
+Gelman, Yao & Gabry 2024, JMLR 25, 72).
 """
 
 from dataclasses import dataclass

@@ -46,7 +46,7 @@ class Mixture:
         return replace(joined, mode=mode, log_weight=joined.log_weight - logsumexp(joined.log_weight))
 
     def extended(self, added: "Mixture", share: float) -> "Mixture":
-        """This mixture and another, which holds a share of it and whose components belong to the modes that they lie in."""
+        """This mixture and another, which has a share of it; components added belong to the modes that they lie in."""
         added = replace(added, log_weight=added.log_weight + np.log(share), mode=self.mode_of(added.centre))
         own = replace(self, log_weight=self.log_weight + np.log1p(-share))
         return Mixture(*(np.concatenate([vars(own)[name], vars(added)[name]]) for name in self.__dataclass_fields__))
