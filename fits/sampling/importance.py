@@ -4,8 +4,8 @@ Incremental mixture importance sampling (Raftery & Bao 2010, Biometrics 66, 1162
 Laplace's approximations about the minima of the fit. Where their weights, posterior / mixture, are largest the mixture
 has too little: components are added there, by the information at each place (as of Fasiolo, de Melo & Maskell 2018,
 Stat. Comput. 28, 549), and drawn from. All draws are weighted as those of the whole mixture. So it grows along ridges,
-however they bend. The Pareto k of the largest weights says how well the draws represent the posterior (Vehtari, Simpson,
-Gelman, Yao & Gabry 2024, JMLR 25, 72).
+however they bend. The Pareto k of the largest weights says how well the draws represent the posterior (Vehtari,
+Simpson, Gelman, Yao & Gabry 2024, JMLR 25, 72).
 """
 
 from dataclasses import dataclass
