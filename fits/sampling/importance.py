@@ -86,9 +86,9 @@ def importance_draws(
     problem, fewest = fit.problem, ROUNDS_ALONG_RIDGES if fit.unidentified and initial is None else 0
     mixture = initial or initial_mixture(fit, share, smallest_mode)
     positions = mixture.draw(generator, max(draws, FEWEST))
-    heights, log_density = log_posteriors(problem, positions, share), mixture.log_density(positions)
+    log_posterior, log_density = log_posteriors(problem, positions, share), mixture.log_density(positions)
     for number in range(ROUNDS + 1):
-        weights = np.where(np.isfinite(heights), heights - log_density, -np.inf)
+        weights = np.where(np.isfinite(log_posterior), log_posterior - log_density, -np.inf)
         found = ImportanceDraws(positions, weights, _pareto_k(weights), mixture)
         enough = max(MIN_EFFECTIVE_DRAWS, efficiency * len(positions))
         suffices = found.pareto_k < max_pareto_k and found.effective_sample_size >= enough
@@ -107,7 +107,7 @@ def importance_draws(
         log_density = np.logaddexp(log_density, other + np.log(of_added))
         mixture = mixture.extended(added, of_added)
         positions = np.concatenate([positions, fresh])
-        heights = np.append(heights, log_posteriors(problem, fresh, share, compiled=True))
+        log_posterior = np.append(log_posterior, log_posteriors(problem, fresh, share, compiled=True))
     return found
 
 
