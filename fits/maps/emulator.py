@@ -79,6 +79,10 @@ class Emulator(eqx.Module):
         """What `of` takes."""
         return {one.name: np.asarray(getattr(self, one.name)) for one in fields(self) if one.name != "highest"}
 
+    def predict(self, model: Model, vector: Array) -> Array:
+        """Scaled BSDF of a model, (N, C), in 1/sr."""
+        return model.build(vector).scale * self.values(vector)
+
     def values(self, vector: Array) -> Array:
         """BSDF of the data, (N, C), in 1/sr, with these parameters (P,)."""
 
@@ -100,21 +104,6 @@ def chebyshev(x: Array, count: int) -> Array:
     for _ in range(2, count):
         basis.append(2.0 * x * basis[-1] - basis[-2])
     return jnp.stack(basis[:count])
-
-
-class EmulatedModel(Model):
-    """A model whose values come from an emulator in the place of its transport."""
-
-    emulator: Emulator
-
-    def predict(self, vector: Array) -> Array:
-        """Scaled BSDF, (N, C), in 1/sr."""
-        return self.build(vector).scale * self.emulator.values(vector)
-
-
-def with_emulator(model: Model, emulator: Emulator) -> EmulatedModel:
-    """The model with the emulator."""
-    return EmulatedModel(**{one.name: getattr(model, one.name) for one in fields(Model)}, emulator=emulator)
 
 
 # ---- how it is made ----

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 import layerjax as lj
 from fits.data.measurements import Measurements, channel_names
 from fits.maps.common import fit_common, with_common
-from fits.maps.emulator import Emulator, emulate, with_emulator
+from fits.maps.emulator import Emulator, emulate
 from fits.maps.inputs import Block, MapData, Measured
 from fits.maps.options import MapOptions
 from fits.maps.search import Starts, fit_pilot_texels, reduced_chi_square, sigmas, starts_at
@@ -78,7 +78,7 @@ class Job:
 def map_problem(problem: Problem, own_directions: bool, emulator: Emulator | None) -> Problem:
     """A problem with the model of a map; own_directions: of each texel."""
     problem = with_own_directions(problem) if own_directions else problem
-    return problem if emulator is None else problem.with_model(with_emulator(problem.model, emulator))
+    return problem if emulator is None else problem.with_model(replace(problem.model, stand_in=emulator))
 
 
 def least_floor(problem: Problem) -> float:

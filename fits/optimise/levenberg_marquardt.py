@@ -268,7 +268,7 @@ def _initial(model: Any, unit: Array, fresh: Array) -> tuple[State, Array, Array
     it; NaN: its own."""
     vector = model.box.from_unit(unit)
     held = model.objective == "likelihood" and model.varying
-    predicted, rows = jax.eval_shape(model.linearised(model.nothing_known, vector).linear_parts, vector)[1]
+    predicted, rows = jax.eval_shape(model.linearised(model.nothing_known).linear_parts, vector)[1]
     auxiliary = jnp.zeros(predicted.shape, predicted.dtype), jnp.zeros(rows.shape, rows.dtype)
     watched = jnp.zeros((unit.size, *rows.shape), rows.dtype)
     state = first_state(unit, jnp.where(fresh, FIRST_DAMPING, NEARBY), auxiliary, watched)
@@ -279,7 +279,7 @@ def _advance(
     model: Any, state: State, known: list[Linearisation], sigma: Array, rough: Array, tolerance: Array
 ) -> tuple[State, Array, Array]:
     """A step by what is known at its trial; and the physical vectors, (P,), of the best point and the next trial."""
-    near, varying = model.linearised(known, model.box.from_unit(state.trial)), _varying(model)
+    near, varying = model.linearised(known), _varying(model)
     first_step = (jnp.where(rough, sigma, jnp.nan), jnp.where(rough, 0.0, 1.0)) if varying else None
 
     def residuals(unit: Array) -> Any:

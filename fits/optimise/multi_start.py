@@ -18,7 +18,7 @@ from scipy.stats import qmc
 import layerjax
 from fits.data.geometry import Floats
 from fits.optimise.levenberg_marquardt import COST_TOLERANCE, ROUGH_TOLERANCE, Descent, descent, evaluate_at
-from fits.optimise.uncertainty import Uncertainty, uncertainty
+from fits.optimise.uncertainty import Uncertainty, scatter, uncertainty
 from fits.problem.compilation import cores, on_all_cores
 from fits.problem.model import Model
 from fits.problem.problem import FittingProblem
@@ -221,9 +221,7 @@ def polish(
     lowest = lowest._replace(vector=np.where(held, nearest, np.clip(vector, low, high)))
     predicted = evaluate_at(problem, unit_of(problem, lowest.vector)).predicted if held.any() else found.predicted
     # 5. the reduced chi-square where it is above 1; of a named objective, the residual variance
-    freedom, excess = problem.count - len(lowest.vector), 1.0
-    if not likelihood:
-        excess = 2.0 * lowest.cost / max(freedom, 1)
-    elif freedom > 0:
+    freedom, excess = problem.count - len(lowest.vector), float(scatter(problem, lowest.cost, problem.count))
+    if likelihood and freedom > 0:
         excess = max(1.0, float(problem.call(Model.chi_square_at, lowest.vector, predicted)) / freedom)
     return Optimum(problem, [*ends[:best], lowest, *ends[best + 1 :]], best, found, improved, predicted, excess)

@@ -7,7 +7,7 @@ that of several.
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
 from itertools import pairwise
 from typing import Any, Literal, NamedTuple, cast
 
@@ -65,10 +65,15 @@ class Parts(NamedTuple):
 
 
 class Linearisation(NamedTuple):
-    """What a model predicts at a vector, (N, C), in 1/sr, and its slopes by the first parameters, (M, N, C)."""
+    """What a model predicts, (N, C), in 1/sr, with slopes by the first parameters, (M, N, C), at these values, (M,)."""
 
     values: Any
     slopes: Any
+    at: Any
+
+    def predict(self, model: "Model", vector: Array) -> Array:
+        """Scaled BSDF, (N, C), in 1/sr, of the model near there."""
+        return self.values + jnp.tensordot(vector[: len(self.at)] - self.at, self.slopes, 1)
 
 
 class Model(eqx.Module):
@@ -81,7 +86,8 @@ class Model(eqx.Module):
     below, (N, C), in 1/sr. known: what is known of the directions beforehand. optics: how an instrument sees them, None
     for exact directions. process: the model discrepancy, with the softness of its `logarithm`, (N, C), in 1/sr; None
     without. side: "reflection" if all directions lie above. varying: whether sigma depends on the parameters. moving:
-    so many of them come first, on which predictions depend; the others are those of the noise.
+    so many of them come first, on which predictions depend; the others are those of the noise. stand_in: whose
+    `predict(model, vector)` takes the place of what the transport says, if any: a `Linearisation` or an emulator.
     """
 
     template: Template
@@ -102,6 +108,7 @@ class Model(eqx.Module):
     tails: Tails = eqx.field(static=True)
     varying: bool = eqx.field(static=True)
     moving: int = eqx.field(static=True)
+    stand_in: Any = None
 
     def residuals(self, vector: Array) -> tuple[Array, ...]:
         """`residuals_at` what these parameters predict."""
@@ -142,14 +149,15 @@ class Model(eqx.Module):
         projection = project(weights, size(values, softness) / total_sigma(values, variance, relative, floor))
         return replace(self, process=replace(self.process, projection=jax.tree.map(jnp.asarray, projection)))
 
-    def linearised(self, known: Sequence[Linearisation], at: Array) -> "Model":
-        """The model near a vector (P,) that its one data set was linearised at."""
-        return linear(self, known[0], at)
+    def linearised(self, known: Sequence[Linearisation]) -> "Model":
+        """The model near the vector (P,) that its one data set was linearised at."""
+        return replace(self, stand_in=known[0])
 
     @property
     def nothing_known(self) -> list[Linearisation]:
         """In the shape of what `linearised` asks for, of the one data set."""
-        return [Linearisation(jnp.zeros_like(self.values), jnp.zeros((self.moving, *self.values.shape)))]
+        slopes = jnp.zeros((self.moving, *self.values.shape), self.values.dtype)
+        return [Linearisation(jnp.zeros_like(self.values), slopes, self.box.low[: self.moving])]
 
     @property
     def places(self) -> tuple[tuple[int, ...], ...]:
@@ -162,6 +170,8 @@ class Model(eqx.Module):
 
     def predict(self, vector: Array) -> Array:
         """Scaled BSDF, (N, C), in 1/sr: a stack of one channel has the same in all."""
+        if self.stand_in is not None:
+            return self.stand_in.predict(self, vector)
         parts = self.build(vector)
 
         def values(wi: Array, wo: Array, known: KnownDirections | None) -> Array:
@@ -317,23 +327,8 @@ class Model(eqx.Module):
 def linearise(model: Model, vector: Array) -> Linearisation:
     """Values and slopes at a vector (P,), by the parameters that predictions depend on."""
     steps = jnp.eye(vector.size, dtype=vector.dtype)[: model.moving]
-    return Linearisation(*jax.vmap(lambda step: jax.jvp(model.predict, (vector,), (step,)), out_axes=(None, 0))(steps))
-
-
-class Linear(Model):
-    """A model near a vector `at` (P,), by what is known there."""
-
-    near: Linearisation
-    at: Array
-
-    def predict(self, vector: Array) -> Array:
-        """Scaled BSDF, (N, C), in 1/sr."""
-        return self.near.values + jnp.tensordot((vector - self.at)[: len(self.near.slopes)], self.near.slopes, 1)
-
-
-def linear(model: Model, near: Linearisation, at: Array) -> Linear:
-    """The model near a vector (P,) that it was linearised at."""
-    return Linear(**{one.name: getattr(model, one.name) for one in fields(Model)}, near=near, at=at)
+    found = jax.vmap(lambda step: jax.jvp(model.predict, (vector,), (step,)), out_axes=(None, 0))(steps)
+    return Linearisation(*found, vector[: model.moving])
 
 
 class JointModel(eqx.Module):
@@ -352,10 +347,9 @@ class JointModel(eqx.Module):
     log_likelihood, log_likelihood_per_datum = Model.log_likelihood, Model.log_likelihood_per_datum
     log_posterior_unconstrained = Model.log_posterior_unconstrained
 
-    def linearised(self, known: Sequence[Linearisation], at: Array) -> "JointModel":
-        """The model near a vector (P,) that its data sets were linearised at."""
-        parts = zip(self._with_vectors(at), known, strict=True)
-        return replace(self, parts=tuple(linear(part, there, own) for (part, own), there in parts))
+    def linearised(self, known: Sequence[Linearisation]) -> "JointModel":
+        """The model near the vector (P,) that its data sets were linearised at."""
+        return replace(self, parts=tuple(part.linearised([one]) for part, one in zip(self.parts, known, strict=True)))
 
     @property
     def nothing_known(self) -> list[Linearisation]:
