@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from fits.data.geometry import TANGENT_COSINE, Floats, Pairs
 from fits.data.scans import Angles, rows_of
 from fits.names import QUANTITIES, Quantity
+from layerjax._checks import require_number
 
 LARGEST, SMALLEST_SIGMA = 1e30, 1e-100
 """Bounds of |values| and of the standard deviations of used samples, in 1/sr: squared residuals are then finite."""
@@ -191,7 +192,7 @@ class Measurements(Pairs):
 
         A detector head blocks the beam there. Raises ValueError for an angle out of range.
         """
-        _check_angle(degrees, 180.0)
+        require_number("degrees", degrees, 0.0, 180.0)
         angle = np.degrees(2 * np.arcsin(np.clip(np.linalg.norm(self.wi - self.wo, axis=-1) / 2, 0, 1)))
         return self.where(angle >= degrees, f"masked: within {degrees:g} degrees of retro-reflection")
 
@@ -200,7 +201,7 @@ class Measurements(Pairs):
 
         Raises ValueError for an angle out of range.
         """
-        _check_angle(degrees, 90.0)
+        require_number("degrees", degrees, 0.0, 90.0)
         tilt = np.maximum(np.minimum(self.theta_i, 180 - self.theta_i), np.minimum(self.theta_o, 180 - self.theta_o))
         return self.where(tilt <= degrees, f"masked: more than {degrees:g} degrees from the normal")
 
@@ -234,8 +235,3 @@ def channel_names(count: int) -> tuple[str, ...]:
     """Names for channels that have none: value, or red, green, blue, or channel1, channel2, ..."""
     known: dict[int, Sequence[str]] = {1: ("value",), 3: ("red", "green", "blue")}
     return tuple(known.get(count, [f"channel{number}" for number in range(1, count + 1)]))
-
-
-def _check_angle(degrees: float, high: float) -> None:
-    if not 0 <= degrees <= high:
-        raise ValueError(f"degrees is {degrees}, must be in [0, {high:g}]")

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from numbers import Real
 from pathlib import Path
 from typing import Any, Self
 
@@ -13,6 +12,7 @@ from fits.data.formats import FileOptions, read_file
 from fits.data.measurements import Measurements
 from fits.data.scans import select
 from fits.data.totals import Totals
+from layerjax._checks import require_number
 
 CHANNELS = "channels="
 READERS = ("format", "quantity", "bins", "strata", "wavelengths", "corrected")
@@ -68,9 +68,8 @@ class ReadOptions(FileOptions):
 
     def __post_init__(self) -> None:
         for name, high in (("min_retro_angle", 180.0), ("max_polar_angle", 90.0)):
-            angle = getattr(self, name)
-            if not (angle is None or (isinstance(angle, Real) and 0.0 <= float(angle) <= high)):
-                raise ValueError(f"{name} is {angle!r:.60}, must be in [0, {high:g}] degrees")
+            if (angle := getattr(self, name)) is not None:
+                require_number(name, angle, 0.0, high)
         for name in ("select", "hold_out"):
             if not isinstance(words := getattr(self, name), list | tuple):
                 raise ValueError(f"{name} is {words!r:.60}, must be a list of selections, such as ['incidence=10,50']")

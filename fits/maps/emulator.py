@@ -21,14 +21,11 @@ from numpy.typing import NDArray
 from scipy import fft
 from scipy.stats import qmc
 
+from fits.data.geometry import Floats, Integers, Truths
 from fits.maps.options import DEFAULT, MapOptions
 from fits.problem.compilation import cores, in_shares
 from fits.problem.model import Model
 from fits.problem.problem import Problem
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
-Truths = NDArray[np.bool_]
 
 CORNERS, LINE_NODES, CHECKS, ROUNDS = 12, 33, 64, 3
 """Lines through the box beside its middle, nodes on each, points that are checked, and emulators tried."""

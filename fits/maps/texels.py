@@ -17,17 +17,14 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jax.flatten_util import ravel_pytree
-from numpy.typing import NDArray
 
+from fits.data.geometry import Floats, Integers, Truths
 from fits.optimise.levenberg_marquardt import COST_TOLERANCE, FIRST_DAMPING, NEARBY, State, first_state
 from fits.optimise.levenberg_marquardt import step as step_of
 from fits.optimise.multi_start import MOST_STEPS
-from fits.optimise.uncertainty import LEAST_GRADIENT, UNIDENTIFIED_BEYOND, Truths, errors_in_boxes, scatter
+from fits.optimise.uncertainty import LEAST_GRADIENT, UNIDENTIFIED_BEYOND, errors_in_boxes, scatter
 from fits.problem.model import Linearisation, Model, linearise
 from fits.problem.problem import Problem
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
 
 OMITTED = 1e9  # standard deviation of a value that is omitted, in units of the largest: it weighs less than rounding
 
@@ -70,7 +67,7 @@ class Texels(NamedTuple):
         return Texels(*(None if part is None else part[places] for part in self))
 
     @property
-    def measurements(self) -> NDArray[np.int64]:
+    def measurements(self) -> Integers:
         """How many of each texel count, (M,)."""
         return np.sum(self.used, axis=(1, 2))
 

@@ -223,5 +223,6 @@ def polish(
     # 5. the reduced chi-square where it is above 1; of a named objective, the residual variance
     freedom, excess = problem.count - len(lowest.vector), float(scatter(problem, lowest.cost, problem.count))
     if likelihood and freedom > 0:
-        excess = max(1.0, float(problem.call(Model.chi_square_at, lowest.vector, predicted)) / freedom)
+        residuals = np.asarray(problem.call(Model.whitened_residuals_at, lowest.vector, predicted))
+        excess = max(1.0, float(np.sum(residuals**2)) / freedom)
     return Optimum(problem, [*ends[:best], lowest, *ends[best + 1 :]], best, found, improved, predicted, excess)

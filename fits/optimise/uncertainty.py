@@ -12,13 +12,10 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from numpy.typing import NDArray
 
-from fits.data.geometry import Floats
+from fits.data.geometry import Floats, Truths
 from fits.optimise.levenberg_marquardt import evaluate_at
 from fits.problem.problem import FittingProblem
-
-Truths = NDArray[np.bool_]
 
 ON_BOUND = 1e-6  # of the box
 LEAST_GRADIENT = 1e-6  # of the log-posterior, over the whole box: what pushes less against a bound does not push

@@ -118,10 +118,6 @@ class Model(eqx.Module):
         """Half the sum of squared residuals."""
         return 0.5 * jnp.sum(jnp.stack([jnp.sum(part**2) for part in self.residuals_at(vector, predicted)]))
 
-    def log_likelihood_per_datum(self, vector: Array) -> Array:
-        """`log_likelihood_per_datum_at` what these parameters predict."""
-        return self.log_likelihood_per_datum_at(vector, self.predict(vector))
-
     def log_likelihood(self, vector: Array) -> Array:
         """Normalised log-likelihood of all data."""
         return self.log_likelihood_at(vector, self.predict(vector))
@@ -211,13 +207,6 @@ class Model(eqx.Module):
         if self.process is None:
             return self.standardised_at(vector, predicted)
         return -self.process.whitened_residuals(*self._of_process(vector, predicted))
-
-    def chi_square_at(self, vector: Array, predicted: Array) -> Array:
-        """z'S^-1 z of `standardised_at` z, with S their covariance: 1 without model discrepancy."""
-        if self.process is None:
-            return jnp.sum(self.standardised_at(vector, predicted) ** 2)
-        found = self.whitened_at(vector, predicted)
-        return jnp.sum(found.unfitted**2) + jnp.sum(found.estimates**2)
 
     def whitened_at(self, vector: Array, predicted: Array, step: Step = None) -> Whitened:
         """Independent residuals of the measurements and of the errors at inducing points."""
@@ -327,8 +316,14 @@ class Model(eqx.Module):
 def linearise(model: Model, vector: Array) -> Linearisation:
     """Values and slopes at a vector (P,), by the parameters that predictions depend on."""
     steps = jnp.eye(vector.size, dtype=vector.dtype)[: model.moving]
-    found = jax.vmap(lambda step: jax.jvp(model.predict, (vector,), (step,)), out_axes=(None, 0))(steps)
-    return Linearisation(*found, vector[: model.moving])
+    along = jax.vmap(lambda step: jax.jvp(model.predict, (vector,), (step,)), out_axes=(None, 0))
+    values, slopes = along(steps)
+    return Linearisation(values, slopes, vector[: model.moving])
+
+
+def predict_each(model: Model, vectors: Array) -> Array:
+    """What each of the vectors (D, P) predicts, (D, N, C), in 1/sr."""
+    return jax.lax.map(model.predict, vectors)
 
 
 class JointModel(eqx.Module):
@@ -344,8 +339,7 @@ class JointModel(eqx.Module):
     objective: Objective = eqx.field(static=True, default="likelihood")  # which weighs data sets by their noise
 
     residuals, cost_at, log_prior = Model.residuals, Model.cost_at, Model.log_prior
-    log_likelihood, log_likelihood_per_datum = Model.log_likelihood, Model.log_likelihood_per_datum
-    log_posterior_unconstrained = Model.log_posterior_unconstrained
+    log_likelihood, log_posterior_unconstrained = Model.log_likelihood, Model.log_posterior_unconstrained
 
     def linearised(self, known: Sequence[Linearisation]) -> "JointModel":
         """The model near the vector (P,) that its data sets were linearised at."""
@@ -376,9 +370,6 @@ class JointModel(eqx.Module):
 
     def log_likelihood_per_datum_at(self, vector: Array, predicted: Array) -> Array:
         return _column(self._each(Model.log_likelihood_per_datum_at, vector, predicted))
-
-    def chi_square_at(self, vector: Array, predicted: Array) -> Array:
-        return jnp.sum(jnp.stack(self._each(Model.chi_square_at, vector, predicted)))
 
     def log_likelihood_at(self, vector: Array, predicted: Array) -> Array:
         return jnp.sum(jnp.stack(self._each(Model.log_likelihood_at, vector, predicted)))

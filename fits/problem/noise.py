@@ -162,15 +162,15 @@ def is_assumed(noise: Noise, used: Measurements) -> bool:
     return noise.relative is None and noise.floor is None and (used.sigma is None or not noise.use_sigma)
 
 
-def noise_levels(noise: Noise, used: Measurements) -> Levels:
-    """The levels of noise, with the defaults that `Noise` states."""
+def noise_levels(noise: Noise, used: Measurements, values: Floats | None = None) -> Levels:
+    """The levels of noise, with the defaults that `Noise` states; values: whose median the floor follows, if others."""
     sigma = used.sigma if noise.use_sigma else None
     relative, floor = noise.relative, noise.floor
     if relative is None:
         relative = DEFAULT_RELATIVE if is_assumed(noise, used) else 0.0
     if floor is None:
         alone = not is_free(relative) and relative == 0
-        floor = 0.0 if alone else DEFAULT_FLOOR * float(np.median(np.abs(used.values)))
+        floor = 0.0 if alone else DEFAULT_FLOOR * float(np.median(np.abs(used.values if values is None else values)))
     return Levels(np.zeros(1) if sigma is None else np.square(sigma), relative, floor)
 
 

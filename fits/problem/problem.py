@@ -31,7 +31,7 @@ from fits.problem.compilation import Static, run
 from fits.problem.discrepancy import Discrepancy, Process, make_process, numbers_of
 from fits.problem.hemispherical import Totalling
 from fits.problem.instrument import Instrument, optics_of, setting_of
-from fits.problem.model import JointModel, Linearisation, Model, Transport, linearise
+from fits.problem.model import JointModel, Linearisation, Model, Transport, linearise, predict_each
 from fits.problem.noise import Levels, Noise, is_assumed, noise_levels, require_size
 from fits.problem.parameters import Box, Free, LogNormal, Normal, is_free, names_of, require_in_range, split
 from layerjax._checks import in_short, require_choice, require_kind, require_number
@@ -149,10 +149,6 @@ class FittingProblem(abc.ABC):
         """Normalised log-likelihood of the used samples with the physical vector (P,)."""
         return self.call(Model.log_likelihood, vector)
 
-    def log_likelihood_per_datum(self, vector: ArrayLike) -> Array:
-        """Normalised log-density of each datum with the physical vector (P,), (N, C)."""
-        return self.call(Model.log_likelihood_per_datum, vector)
-
     def log_prior(self, vector: ArrayLike) -> Array:
         """Log-density of the physical vector, -inf outside the bounds."""
         return self.call(Model.log_prior, vector)
@@ -264,7 +260,7 @@ class Problem(FittingProblem):
         """Scaled BSDF along other directions, (M, 3) each, with D vectors (D, P): (D, M, C), in 1/sr."""
         wi, wo = np.asarray(wi, float), np.asarray(wo, float)
         other = self.with_model(replace(self.model, **_directions(self, wi, wo)))
-        return other.call(_predict_each, vectors)
+        return other.call(predict_each, vectors)
 
     def with_other_rays(self) -> "Problem":
         """The problem with other numbers of rays for the cones of its instrument: what differs is their error."""
@@ -517,7 +513,3 @@ def unit(name: str) -> str:
     """The unit of a parameter of this name; "1" for plain ratios."""
     whole = re.sub(r"\[\d+\]$|\.amplitude$", "", name)  # of a channel, or of a power law's reference
     return next((one for end, one in UNITS.items() if whole.endswith(end)), "1")
-
-
-def _predict_each(model: Model, vectors: Array) -> Array:
-    return jax.lax.map(model.predict, vectors)
