@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from numpy.polynomial.chebyshev import chebpts1
 from numpy.typing import NDArray
 from scipy import fft
 from scipy.stats import qmc
@@ -186,7 +187,7 @@ def _places(problem: Problem) -> Integers | str:
 def _needed_terms(space: _Space, tolerance: float) -> tuple[tuple[int, ...], Floats]:
     """How many terms each coordinate needs, `LINE_NODES` where fewer do not suffice, and the offset (N, C), by lines
     through the middle of the box and some of its corners, near which series are worst."""
-    count, nodes = len(space.low), _nodes(LINE_NODES)
+    count, nodes = len(space.low), chebpts1(LINE_NODES)[::-1]
     corners = np.random.default_rng(0).permuted(np.arange(2**count))[:CORNERS]
     through = np.concatenate([np.zeros((1, count)), 2.0 * (corners[:, None] >> np.arange(count) & 1) - 1.0])
     lines = np.broadcast_to(through[None, :, None], (count, len(through), LINE_NODES, count)).copy()
@@ -204,11 +205,6 @@ def _needed_terms(space: _Space, tolerance: float) -> tuple[tuple[int, ...], Flo
     return tuple(max(2, int(one)) for one in terms), offset
 
 
-def _nodes(count: int) -> Floats:
-    """Zeros of a Chebyshev polynomial."""
-    return np.cos(np.pi * (np.arange(count) + 0.5) / count)
-
-
 def _series(values: Floats, axis: int) -> Floats:
     """Coefficients of Chebyshev series along an axis from values at the polynomial's zeros."""
     coefficients = np.asarray(fft.dct(values, type=2, axis=axis)) / values.shape[axis]
@@ -218,7 +214,7 @@ def _series(values: Floats, axis: int) -> Floats:
 
 def _make(space: _Space, terms: tuple[int, ...], offset: Floats, tolerance: float) -> Emulator:
     orders = np.indices(terms).reshape(len(terms), -1).T
-    nodes = np.stack([_nodes(count)[order] for count, order in zip(terms, orders.T, strict=True)], axis=1)
+    nodes = np.stack([chebpts1(count)[::-1][order] for count, order in zip(terms, orders.T, strict=True)], axis=1)
     values, sigma = space.values(nodes)
     smallest = np.max(np.abs(values), axis=0) * np.finfo(float).tiny + np.finfo(float).tiny
     logarithms = np.log(np.maximum(values + offset, smallest))  # (G, N, C)

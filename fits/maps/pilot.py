@@ -26,7 +26,7 @@ from fits.optimise.multi_start import start_points
 from fits.optimise.resolution import has_rays, leaves_rays_open, resolution_in_words, resolutions
 from fits.problem.model import predict_each
 from fits.problem.noise import Noise, noise_levels
-from fits.problem.parameters import Free, is_free
+from fits.problem.parameters import is_free
 from fits.problem.problem import Problem
 from fits.problem.stack_file import transport_from_dict, transport_to_dict
 from fits.progress import silent
@@ -68,7 +68,7 @@ class Job:
     def texels(self, block: Block) -> tuple[Truths, Texels]:
         """Which texels of a block take part, (block shape), and those of the block, one after the other."""
         measured = self.data.read(block)
-        return measured.mask, texels_of(measured, least_floor(self.prototype))
+        return measured.mask, texels_of(measured)
 
 
 def map_problem(problem: Problem, own_directions: bool, emulator: Emulator | None) -> Problem:
@@ -77,17 +77,11 @@ def map_problem(problem: Problem, own_directions: bool, emulator: Emulator | Non
     return problem if emulator is None else problem.with_model(replace(problem.model, stand_in=emulator))
 
 
-def least_floor(problem: Problem) -> float:
-    """The least that the floor of the noise can be, in 1/sr."""
-    floor = problem.noise.floor
-    return float(floor.arrays()[1]) if isinstance(floor, Free) else float(floor or 0.0)
-
-
-def texels_of(measured: Measured, floor: float) -> Texels:
-    """The texels of a block, one after the other; floor: the least of the noise's, in 1/sr."""
+def texels_of(measured: Measured) -> Texels:
+    """The texels of a block, one after the other."""
     rank = measured.mask.ndim
     values, sigma, _, wi, wo = (None if one is None else one.reshape(-1, *one.shape[rank:]) for one in measured)
-    return make_texels(values, sigma, floor, wi, wo)  # type: ignore[arg-type]
+    return make_texels(values, sigma, wi, wo)  # type: ignore[arg-type]
 
 
 # ---- which texels, and a problem for them ----
@@ -102,7 +96,7 @@ def pilot_texels(data: MapData, count: int) -> Texels:
     chosen: dict[int, Texels] = {}
     for place in dict.fromkeys(order.tolist()):
         at = np.unravel_index(place, data.shape)
-        row = texels_of(data.read(tuple(slice(int(one), int(one) + 1) for one in at)), 0.0)
+        row = texels_of(data.read(tuple(slice(int(one), int(one) + 1) for one in at)))
         if row.measurements[0]:
             chosen[place] = row
         if len(chosen) == count:
@@ -165,7 +159,7 @@ def fit_pilot(
     """Resolution, emulator, common parameters and starts, from the pilot texels of a map of this shape: the arrays that
     a store keeps of them, and what its root says. ValueError: there is no emulator that is required, or no fit."""
     own_directions = texels.wi is not None
-    texels = texels.rows(texels.measurements >= len(problem.names)).with_floor(least_floor(problem))
+    texels = texels.rows(texels.measurements >= len(problem.names))
 
     # the resolution that a fit of its own data ends with
     known = resolutions(problem)

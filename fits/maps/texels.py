@@ -42,15 +42,13 @@ KNOWN = 64  # starts whose linearisation a program takes, or a multiple of that,
 class Texels(NamedTuple):
     """Measurements of M texels.
 
-    values, variance, lowest: (M, N, C), BSDF in 1/sr, the measurement's own variance, enormous for what is omitted,
-    and what sigma cannot fall below. used: (M, N, C) bool. wi, wo: (M, N, 3), None where all texels have the directions
-    of the problem. centre, inverse_sd: (M, P), of Gaussian priors beside those of the problem, in the unit box; None
-    where there are none.
+    values, variance: (M, N, C), BSDF in 1/sr and the measurement's own variance, enormous for what is omitted. used:
+    (M, N, C) bool. wi, wo: (M, N, 3), None where all texels have the directions of the problem. centre, inverse_sd:
+    (M, P), of Gaussian priors beside those of the problem, in the unit box; None where there are none.
     """
 
     values: Any
     variance: Any
-    lowest: Any
     used: Any
     wi: Any = None
     wo: Any = None
@@ -71,20 +69,15 @@ class Texels(NamedTuple):
         """How many of each texel count, (M,)."""
         return np.sum(self.used, axis=(1, 2))
 
-    def with_floor(self, least: float) -> "Texels":
-        """The same with noise whose floor is at least so much, in 1/sr."""
-        return self._replace(lowest=np.sqrt(self.variance + least**2))
-
 
 def make_texels(
     values: Floats,
     sigma: Floats | None = None,
-    least: float = 0.0,
     wi: Floats | None = None,
     wo: Floats | None = None,
 ) -> Texels:
     """Values (M, N, C), with their standard deviations of that shape; what is not finite is omitted, in single
-    precision also what is finite only in double. least: of the noise's floor.
+    precision also what is finite only in double.
     """
     largest_number = float(jnp.finfo(jnp.result_type(float)).max)
     used, variance = np.abs(values) <= largest_number, np.zeros(values.shape)
@@ -95,12 +88,12 @@ def make_texels(
         largest = np.max(np.abs(values), initial=0.0, where=used, axis=(1, 2), keepdims=True)
         ignored = np.minimum(np.square(OMITTED * np.where(largest > 0.0, largest, 1.0)), 0.25 * largest_number)
     variance = np.where(used, variance, ignored)
-    return Texels(np.where(used, values, 0.0), variance, variance, used, wi, wo).with_floor(least)
+    return Texels(np.where(used, values, 0.0), variance, used, wi, wo)
 
 
 def model_of(model: Model, row: Texels) -> Model:
     """The model with the measurements of one texel, (N, C), and the priors that it has beside those of the problem."""
-    model = eqx.tree_at(lambda m: (m.values, m.variance, m.lowest), model, (row.values, row.variance, row.lowest))
+    model = eqx.tree_at(lambda m: (m.values, m.variance), model, (row.values, row.variance))
     if row.wi is not None:
         model = eqx.tree_at(lambda m: (m.wi, m.wo), model, (row.wi, row.wo))
     if row.centre is None:

@@ -40,7 +40,7 @@ from fits.problem.model import Transport
 from fits.problem.noise import Noise
 from fits.problem.parameters import Free
 from fits.problem.problem import FittingProblem, Problem
-from fits.progress import Progress, given_progress, silent
+from fits.progress import Progress, given_progress, named, silent
 from layerjax._checks import require_count, require_kind, require_seed
 from layerjax.compiling import programs_kept
 
@@ -116,11 +116,8 @@ def fit(
         points.append(unit_of(whole, np.array([values[name] for name in whole.names])))
     others = start_points(whole, min(starts, MOST_STARTS // 2), seed)
 
-    def progress_again(stage: str, done: int, total: int | None = None, info: str = "") -> None:
-        run.progress(f"{stage} with model discrepancy", done, total, info)
-
     checkpoint = None if checkpoint is None else discrepancy_checkpoint(checkpoint)
-    again = run._replace(progress=progress_again, checkpoint=checkpoint)
+    again = run._replace(progress=named("with model discrepancy", run.progress), checkpoint=checkpoint)
     return _fit_from(whole, np.concatenate([points, others]), again, without)
 
 

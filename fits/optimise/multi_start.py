@@ -5,8 +5,8 @@ L-BFGS-B of scipy, by jaxopt, shares the objective alone: it checks a minimum on
 """
 
 import warnings
-from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import AbstractContextManager, nullcontext
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -19,12 +19,11 @@ import layerjax
 from fits.data.geometry import Floats
 from fits.optimise.levenberg_marquardt import COST_TOLERANCE, ROUGH_TOLERANCE, Descent, descent, evaluate_at
 from fits.optimise.uncertainty import Uncertainty, scatter, uncertainty
-from fits.problem.compilation import cores, on_all_cores
+from fits.problem.compilation import as_finished, on_all_cores
 from fits.problem.model import Model
 from fits.problem.problem import FittingProblem
 from fits.progress import Progress
 from fits.store import Store, fingerprint
-from layerjax._numerics import broadcasting
 
 MOST_STEPS, MOST_ROUNDS = 200, 20  # steps of a start in a round; and rounds, while each gains the next
 LEAST_GAIN, LEAST_RELATIVE_GAIN = 1e-3, 1e-6  # in the log-posterior; for a named objective, as a share of the cost
@@ -48,23 +47,13 @@ def multi_start(
     every = range(len(points))
     stored = {} if store is None else {index: found for index in every if (found := store.get(f"start {index}"))}
     ends = {index: Descent(**found) for index, found in stored.items()}
-
-    def ended(index: int, end: Descent) -> None:
+    left = [index for index in every if index not in ends]
+    for place, end in as_finished(partial(rough_descent, problem), points[left]):
+        index = left[place]
         ends[index] = end
         if store is not None:
             store.put(f"start {index}", end._replace(gradient=None, root=None, predicted=None)._asdict())
         progress("fit", len(ends), len(points), f"best cost {min(end.cost for end in ends.values()):.6g}")
-
-    left = [index for index in every if index not in ends]
-    for index in left[:1]:  # alone: it compiles the program, which keeps one core busy
-        ended(index, rough_descent(problem, points[index]))
-    pool = ThreadPoolExecutor(cores())
-    try:
-        running = {pool.submit(broadcasting(rough_descent), problem, points[index]): index for index in left[1:]}
-        for future in as_completed(running):
-            ended(running[future], future.result())
-    finally:
-        pool.shutdown(cancel_futures=True)
     return [ends[index] for index in every]
 
 

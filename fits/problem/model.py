@@ -82,8 +82,8 @@ class Model(eqx.Module):
     What ends with `_at` takes what the vector predicts, (N, C), beside it, so that nothing is computed twice.
 
     template: of `Parts`. box: bounds and priors of the P parameters. wi, wo: directions of the N samples, (N, 3).
-    values: BSDF, (N, C), in 1/sr. variance: the measurement's own, (N, C), in 1/sr^2. lowest: what sigma cannot fall
-    below, (N, C), in 1/sr. known: what is known of the directions beforehand. optics: how an instrument sees them, None
+    values: BSDF, (N, C), in 1/sr. variance: the measurement's own, (N, C), in 1/sr^2. least_floor: of the
+    noise, in 1/sr. known: what is known of the directions beforehand. optics: how an instrument sees them, None
     for exact directions. process: the model discrepancy, with the softness of its `logarithm`, (N, C), in 1/sr; None
     without. side: "reflection" if all directions lie above. varying: whether sigma depends on the parameters. moving:
     so many of them come first, on which predictions depend; the others are those of the noise. stand_in: whose
@@ -96,7 +96,7 @@ class Model(eqx.Module):
     wo: Array
     values: Array
     variance: Array
-    lowest: Array
+    least_floor: Array
     degrees_of_freedom: Array
     transport: Transport
     known: KnownDirections | None
@@ -109,6 +109,11 @@ class Model(eqx.Module):
     varying: bool = eqx.field(static=True)
     moving: int = eqx.field(static=True)
     stand_in: Any = None
+
+    @property
+    def lowest(self) -> Array:
+        """What sigma cannot fall below, (N, C), in 1/sr."""
+        return jnp.hypot(jnp.sqrt(self.variance), self.least_floor)
 
     def residuals(self, vector: Array) -> tuple[Array, ...]:
         """`residuals_at` what these parameters predict."""

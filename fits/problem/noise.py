@@ -136,10 +136,9 @@ class Levels(NamedTuple):
     floor: float | Free
 
     @property
-    def smallest(self) -> Floats:
-        """What sigma cannot fall below, (N, C) or (1,), in 1/sr."""
-        floor = self.floor.low if isinstance(self.floor, Free) else self.floor
-        return np.sqrt(self.variance + np.square(floor))
+    def least_floor(self) -> float:
+        """What the floor cannot fall below, in 1/sr."""
+        return float(self.floor.arrays()[1]) if isinstance(self.floor, Free) else self.floor
 
     @property
     def fitted(self) -> bool:

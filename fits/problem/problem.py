@@ -31,7 +31,7 @@ from fits.problem.compilation import Static, run
 from fits.problem.discrepancy import Discrepancy, Process, make_process, numbers_of
 from fits.problem.hemispherical import Totalling
 from fits.problem.instrument import Instrument, optics_of, setting_of
-from fits.problem.model import JointModel, Linearisation, Model, Transport, linearise, predict_each
+from fits.problem.model import JointModel, Linearisation, Model, Parts, Transport, linearise, predict_each
 from fits.problem.noise import Levels, Noise, is_assumed, noise_levels, require_size
 from fits.problem.parameters import Box, Free, LogNormal, Normal, is_free, names_of, require_in_range, split
 from layerjax._checks import in_short, require_choice, require_kind, require_number
@@ -276,13 +276,6 @@ class Problem(FittingProblem):
         return other
 
 
-class JointParts(NamedTuple):
-    """Stacks and calibration factors of data sets, by their names."""
-
-    stack: dict[str, Any]
-    scale: dict[str, Any]
-
-
 class Joint(FittingProblem):
     """Data sets that are fitted together, each a `Problem` of its own, with parameters in common.
 
@@ -347,11 +340,12 @@ class Joint(FittingProblem):
                 raise ValueError(f"Joint.shared: {words}")
         return common
 
-    def build(self, vector: ArrayLike) -> JointParts:
-        """Stacks and scales with the physical vector (P,)."""
+    def build(self, vector: ArrayLike) -> Parts:
+        """Stacks, scales and noise levels with the physical vector (P,), each by the names of the data sets."""
         vector = np.asarray(vector)
         built = {name: problem.build(vector[list(self.places(name))]) for name, problem in self.parts.items()}
-        return JointParts(*({name: one[k] for name, one in built.items()} for k in range(2)))
+        parts: Any = (dict(zip(built, one, strict=True)) for one in zip(*built.values(), strict=True))
+        return Parts(*parts)
 
     @property
     def problems(self) -> dict[str, Problem]:
@@ -401,7 +395,7 @@ def _assemble(problem: Problem) -> Assembled:
         box=Box.of(free.values()),
         values=jnp.asarray(used.values),
         variance=jnp.asarray(np.broadcast_to(levels.variance, used.values.shape)),
-        lowest=jnp.asarray(np.broadcast_to(levels.smallest, used.values.shape)),
+        least_floor=jnp.asarray(levels.least_floor),
         degrees_of_freedom=jnp.asarray(float(noise.degrees_of_freedom)),
         transport=Totalling.of(used, problem.transport) if isinstance(used, Totals) else problem.transport,
         process=process,
@@ -447,7 +441,7 @@ def _require_kinds(problem: Problem) -> None:
 def _require_weights(objective: Objective, levels: Levels, process: Process | None, free: Mapping[str, Free]) -> None:
     """A likelihood needs noise; beside a named residual nothing may stand that only a likelihood weighs."""
     if objective == "likelihood":
-        if not np.all(levels.smallest > 0):
+        if not np.all(levels.variance + np.square(levels.least_floor) > 0):
             raise ValueError("noise: sigma could become 0; give a floor above 0, or data with sigma")
         return
     weighed = [f"noise.{name}" for name in ("relative", "floor") if is_free(getattr(levels, name))]
