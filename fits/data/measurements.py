@@ -14,7 +14,6 @@ from numpy.typing import ArrayLike, NDArray
 from fits.data.geometry import TANGENT_COSINE, Floats, Pairs
 from fits.data.scans import Angles, rows_of
 from fits.names import QUANTITIES, Quantity
-from layerjax._checks import require_number
 
 LARGEST, SMALLEST_SIGMA = 1e30, 1e-100
 """Bounds of |values| and of the standard deviations of used samples, in 1/sr: squared residuals are then finite."""
@@ -186,24 +185,6 @@ class Measurements(Pairs):
             sigma=None if self.sigma is None else self.sigma[:, columns],
             channels=tuple(self.channels[column] for column in columns),
         )
-
-    def without_retro(self, degrees: float) -> "Measurements":
-        """The same samples, those closer than `degrees` (0 to 180) to retro-reflection masked.
-
-        A detector head blocks the beam there. Raises ValueError for an angle out of range.
-        """
-        require_number("degrees", degrees, 0.0, 180.0)
-        angle = np.degrees(2 * np.arcsin(np.clip(np.linalg.norm(self.wi - self.wo, axis=-1) / 2, 0, 1)))
-        return self.where(angle >= degrees, f"masked: within {degrees:g} degrees of retro-reflection")
-
-    def without_grazing(self, degrees: float) -> "Measurements":
-        """The same samples, masked where light or viewer is more than `degrees` (0 to 90) from the normal line.
-
-        Raises ValueError for an angle out of range.
-        """
-        require_number("degrees", degrees, 0.0, 90.0)
-        tilt = np.maximum(np.minimum(self.theta_i, 180 - self.theta_i), np.minimum(self.theta_o, 180 - self.theta_o))
-        return self.where(tilt <= degrees, f"masked: more than {degrees:g} degrees from the normal")
 
     def noted(self, *notes: str) -> "Measurements":
         """The same samples with notes added to their source."""

@@ -347,8 +347,8 @@ def _step(model: Model, fresh: Array, most_steps: Array, run: _Descent, row: Tex
     levels = likelihood and model.varying
     first_step = (jnp.where(run.rough, run.sigma, jnp.nan), jnp.ones(())) if levels else None
 
-    def residuals(unit: Array) -> tuple[Any, Linearisation]:
-        return own.linear_parts(model.box.from_unit(unit), first_step)[0], trial
+    def residuals(unit: Array) -> tuple[Any, Linearisation, None]:
+        return own.linear_parts(model.box.from_unit(unit), first_step)[0], trial, None
 
     first = run.state.steps == 0
     tolerance, logarithmic = COST_TOLERANCE if likelihood else None, model.logarithmic if levels else ()

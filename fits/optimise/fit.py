@@ -190,8 +190,6 @@ def _result(at: Optimum, accuracy: Accuracy | None, run: _Run, without: Mapping[
     problem, lowest, found, options = at.problem, at.lowest, at.uncertainty, run.options
     at_bound = tuple(name for name, held in zip(problem.names, found.at_bound, strict=True) if held)
     minima, outcomes = _minima(problem, at, options)
-    equivalent = options.equivalent_cost * at.excess
-    alternatives = tuple(minimum for minimum in minima[1:] if minimum.cost - lowest.cost < equivalent)
     result = Fit(
         problem=cast(Problem, problem),  # or a `Joint`, of whose data sets `Fit.part` says more
         vector=lowest.vector,
@@ -205,7 +203,6 @@ def _result(at: Optimum, accuracy: Accuracy | None, run: _Run, without: Mapping[
         unidentified=found.unidentified,
         insensitive=found.insensitive,
         minima=minima,
-        alternatives=alternatives,
         settings={"starts": run.starts, "seed": run.seed, **asdict(options)},
         start_outcomes=outcomes,
         numerical_error=None if accuracy is None else accuracy.error,
@@ -256,6 +253,7 @@ def _minima(problem: FittingProblem, at: Optimum, options: FitOptions) -> tuple[
             values=dict(zip(problem.names, map(float, ends[leader].vector), strict=True)),
             cost=float(cost[leader]),
             count=count,
+            equivalent=leader != leaders[0] and bool(cost[leader] - cost[best] < options.equivalent_cost * at.excess),
         )
         for leader, count in zip(leaders, counts, strict=True)
     )

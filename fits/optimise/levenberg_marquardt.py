@@ -45,7 +45,7 @@ class State(eqx.Module):
     """Where a descent in the unit box [0, 1]^P has come to after `steps` trials.
 
     point: (P,), the best so far, with what is known there: cost, gradient (P,) and normal matrix (P, P), the auxiliary
-    output of the residuals, and the Jacobian of what is watched of it, a leading axis for the parameters.
+    output of the residuals, and the Jacobian of what is watched, a leading axis for the parameters.
     trial: (P,), what is tried next, to gain `predicted` in the cost; full_decrease: more cannot be gained.
     ended: nothing is left to gain, or no step gains anything; failed: no step does though something is left, or the
     start has residuals that are not finite.
@@ -89,23 +89,22 @@ def first_state(point: Array, damping: Array, auxiliary: Any, watched: Any = Non
 
 
 def step(
-    residuals: Callable[[Array], tuple[Any, Any]],
+    residuals: Callable[[Array], tuple[Any, Any, Any]],
     state: State,
     tolerance: Array | float | None = None,
     logarithmic: tuple[int, ...] = (),
-    watch: Callable[[Any], Any] = lambda auxiliary: None,
 ) -> State:
     """Evaluate the trial, accept or refuse it, and propose the next one.
 
-    residuals: of a point, a tree of arrays, half whose sum of squares is the cost; and an auxiliary output.
+    residuals: of a point, a tree of arrays, half whose sum of squares is the cost; an auxiliary output; and one whose
+        Jacobian is kept, or None.
     tolerance: it ends when a full Gauss-Newton step is predicted to gain less; None: `RELATIVE_TOLERANCE` of the cost.
     logarithmic: places among the leaves of the residuals of those that have logarithms L of noise levels as half their
         squares: dL'dL takes the place of their J'J, which makes the sum the Fisher information (J'J alone would
         overshoot up to twofold at every step).
-    watch: picks the part of the auxiliary output whose Jacobian is kept.
     """
     first = state.steps == 0
-    at_trial = _normal_equations(residuals, state.trial, logarithmic, watch)
+    at_trial = _normal_equations(residuals, state.trial, logarithmic)
     cost, gradient, normal = at_trial[:3]
     finite = jnp.isfinite(cost) & jnp.all(jnp.isfinite(gradient)) & jnp.all(jnp.isfinite(normal))
     ratio = (state.cost - cost) / jnp.where(state.predicted > 0, state.predicted, 1.0)
@@ -147,16 +146,13 @@ def step(
 
 
 def _normal_equations(
-    residuals_of: Callable[[Array], tuple[Any, Any]],
-    y: Array,
-    logarithmic: tuple[int, ...],
-    watch: Callable[[Any], Any],
+    residuals_of: Callable[[Array], tuple[Any, Any, Any]], y: Array, logarithmic: tuple[int, ...]
 ) -> tuple[Array, Array, Array, Any, Any]:
-    """Cost, J'r and J'J at y, the auxiliary output, and the Jacobian of what is watched of it; see `step`."""
+    """Cost, J'r and J'J at y, the auxiliary output, and the Jacobian of what is watched; see `step`."""
 
     def push(tangent: Array) -> tuple[Any, Any, Any, Any]:
-        (residuals, auxiliary), (tangents, moved) = jax.jvp(residuals_of, (y,), (tangent,))
-        return residuals, auxiliary, tangents, watch(moved)
+        (residuals, auxiliary, _), (tangents, _, moved) = jax.jvp(residuals_of, (y,), (tangent,))
+        return residuals, auxiliary, tangents, moved
 
     residuals, auxiliary, columns, watched = jax.vmap(push, out_axes=(None, None, 0, 0))(jnp.eye(y.size, dtype=y.dtype))
     cost, gradient, normal = jnp.zeros((), y.dtype), jnp.zeros_like(y), jnp.zeros((y.size, y.size), y.dtype)
@@ -269,8 +265,7 @@ def _initial(model: Any, unit: Array, fresh: Array) -> tuple[State, Array, Array
     vector = model.box.from_unit(unit)
     held = model.objective == "likelihood" and model.varying
     predicted, rows = jax.eval_shape(model.linearised(model.nothing_known).linear_parts, vector)[1]
-    auxiliary = jnp.zeros(predicted.shape, predicted.dtype), jnp.zeros(rows.shape, rows.dtype)
-    watched = jnp.zeros((unit.size, *rows.shape), rows.dtype)
+    auxiliary, watched = jnp.zeros_like(predicted), jnp.zeros((unit.size, *rows.shape), rows.dtype)
     state = first_state(unit, jnp.where(fresh, FIRST_DAMPING, NEARBY), auxiliary, watched)
     return state, vector, model.initial_sigma(vector) if held else jnp.full((1, 1), jnp.nan)
 
@@ -283,18 +278,18 @@ def _advance(
     first_step = (jnp.where(rough, sigma, jnp.nan), jnp.where(rough, 0.0, 1.0)) if varying else None
 
     def residuals(unit: Array) -> Any:
-        return near.linear_parts(model.box.from_unit(unit), first_step)
+        found, (predicted, rows) = near.linear_parts(model.box.from_unit(unit), first_step)
+        return found, predicted, rows
 
-    logarithmic = model.logarithmic if varying else ()
     enough = tolerance if model.objective == "likelihood" else None
-    state = step(residuals, state, enough, logarithmic, watch=lambda auxiliary: auxiliary[1])
+    state = step(residuals, state, enough, model.logarithmic if varying else ())
     return state, model.box.from_unit(state.point), model.box.from_unit(state.trial)
 
 
 def _end(state: State, vector: Array, steps: int) -> Descent:
     """What is known where a descent ended, at a physical vector (P,)."""
     finite = bool(np.isfinite(state.cost))
-    predicted, _ = state.auxiliary
+    predicted = np.asarray(state.auxiliary, float)
     return Descent(
         vector=np.asarray(vector, float),
         cost=float(state.cost) if finite else math.inf,
@@ -304,7 +299,7 @@ def _end(state: State, vector: Array, steps: int) -> Descent:
         gradient=np.asarray(state.gradient, float),
         # R of the QR decomposition has A's singular values without squaring its condition number
         root=np.linalg.qr(np.asarray(state.watched, float).T, mode="r"),
-        predicted=np.asarray(predicted, float) if finite else np.full(predicted.shape, math.nan),
+        predicted=predicted if finite else np.full(predicted.shape, math.nan),
     )
 
 

@@ -104,7 +104,7 @@ def scatter(problem: FittingProblem, cost: Any, count: Any) -> Any:
     """What differences in cost count in, of fits to so many data: 1, or the residual variance of a named objective."""
     if problem.objective == "likelihood":
         return np.ones_like(cost)
-    return np.maximum(2.0 * cost / np.maximum(count - len(problem.names), 1), np.finfo(float).tiny)
+    return np.maximum(2.0 * cost / np.maximum(count - len(problem.names), 1), np.finfo(np.float32).tiny)
 
 
 def held_by_bounds(unit: Floats, gradient: Floats, least: Any = LEAST_GRADIENT) -> Truths:

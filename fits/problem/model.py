@@ -160,11 +160,6 @@ class Model(eqx.Module):
         slopes = jnp.zeros((self.moving, *self.values.shape), self.values.dtype)
         return [Linearisation(jnp.zeros_like(self.values), slopes, self.box.low[: self.moving])]
 
-    @property
-    def places(self) -> tuple[tuple[int, ...], ...]:
-        """Of the parameters of the one data set: all of them."""
-        return (tuple(range(len(self.box.low))),)
-
     def build(self, vector: Array) -> Parts:
         """Stack, scale and noise levels with these parameters."""
         return Parts(*with_values(self.template.fill(vector)))
@@ -283,12 +278,8 @@ class Model(eqx.Module):
         """Misfit of the logarithm, an error of 1 in it in units of the noise, and the numbers of the process."""
         misfit = logarithm(predicted, self.softness) - logarithm(self.values, self.softness)
         relative = size(self.values, self.softness) / self._noise_at(vector, predicted, step)
-        return misfit, relative, self._correlation(vector, step)
-
-    def _correlation(self, vector: Array, step: Step = None) -> Correlation:
-        at = self.build(vector).correlation
-        assert at is not None
-        return at if step is None else at._replace(amplitude=step[1] * at.amplitude)
+        at = cast(Correlation, self.build(vector).correlation)
+        return misfit, relative, at if step is None else at._replace(amplitude=step[1] * at.amplitude)
 
     def residuals_at(
         self, vector: Array, predicted: Array, step: Step = None, whitened: Whitened | None = None

@@ -57,10 +57,12 @@ PLACES = ("", "scale", "instrument", "noise.relative", "noise.floor", "noise.dis
 
 
 class Assembled(NamedTuple):
-    """What follows from a problem as it was given: its parameters by name, and their density."""
+    """What follows from a problem as it was given: its parameters by name, their density, and for each data set the
+    places of its own in the vector."""
 
     free: dict[str, Free]
     model: Any
+    places: tuple[tuple[int, ...], ...]
 
 
 class FittingProblem(abc.ABC):
@@ -126,7 +128,7 @@ class FittingProblem(abc.ABC):
         """Where the parameters of one data set stand in the vector."""
         if name not in self.problems:
             raise ValueError(f"part {name!r} is not one of {', '.join(self.problems)}")
-        return dict(zip(self.problems, self.model.places, strict=True))[name]
+        return dict(zip(self.problems, self._assembled.places, strict=True))[name]
 
     def shares(self, predicted: Floats) -> dict[str, Floats]:
         """What `predict` gives of each data set, in the shape of its data."""
@@ -318,7 +320,8 @@ class Joint(FittingProblem):
         places = tuple(tuple(place[name] for name in names_of(some)) for some in own.values())
         models = tuple(problem.model for problem in self.parts.values())
         varying = any(one.varying for one in models)
-        return Assembled(free, JointModel(parts=models, box=Box.of(free.values()), places=places, varying=varying))
+        model = JointModel(parts=models, box=Box.of(free.values()), places=places, varying=varying)
+        return Assembled(free, model, places)
 
     def _common(self) -> dict[str, Free]:
         """What is shared, as the first data set has it. ValueError where it is not in every one, or differs."""
@@ -417,7 +420,7 @@ def _assemble(problem: Problem) -> Assembled:
         raise ValueError(f"stack: it has {shape[-1]} channels, the data {used.values.shape[-1]}: {used.channels}")
     if np.broadcast_shapes(shape, used.values.shape) != used.values.shape:
         raise ValueError(f"transport: it gives values of shape {shape}, the data have {used.values.shape}")
-    return Assembled(free, model)
+    return Assembled(free, model, (tuple(range(len(names))),))
 
 
 def _require_kinds(problem: Problem) -> None:
