@@ -9,7 +9,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import jax
 import jax.numpy as jnp
@@ -35,9 +35,6 @@ from fits.sampling.posterior import Posterior
 from fits.sampling.proposals import Density
 from layerjax._checks import in_short, require_count, require_kind, require_number, require_seed
 from layerjax.compiling import programs_kept
-
-if TYPE_CHECKING:
-    from fits.prediction.compare import Average
 
 # quantiles of a `Summary`: the ends of the central 50 % and 95 % intervals, and the median
 LEVELS = (0.025, 0.25, 0.5, 0.75, 0.975)
@@ -240,9 +237,15 @@ def scores(prediction: Prediction, measurements: Measurements, rows: NDArray[np.
     )
 
 
+class Predictor(Protocol):
+    """Several fits that predict as one: see `fits.average`."""
+
+    def predict(self, at: Geometry | Measurements, *, draws: int, seed: int) -> Prediction: ...
+
+
 @programs_kept()
 def predict(
-    fitted: "Fit | Posterior | Average", at: Geometry | Measurements, *, draws: int = DRAWS, seed: int = 0
+    fitted: Fit | Posterior | Predictor, at: Geometry | Measurements, *, draws: int = DRAWS, seed: int = 0
 ) -> Prediction:
     """Predict the BSDF along other directions, and new measurements of it.
 
