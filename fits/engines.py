@@ -18,8 +18,7 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator
 from concurrent import futures
 from contextlib import contextmanager, suppress
-from functools import lru_cache
-from itertools import islice
+from functools import lru_cache, partial
 from multiprocessing import current_process
 from typing import Any, NamedTuple
 
@@ -60,7 +59,10 @@ def run(
     """
     with connected(client, processes) as connection:
         if connection is None:
-            yield from _run_threads(work, shared, list(tasks), threads)
+            from fits.problem.compilation import as_finished
+
+            # threads of JAX run beside each other, for they leave Python while they compute
+            yield from as_finished(partial(attempt, work, shared), tasks, threads)
         else:
             yield from _run_cluster(work, shared, list(tasks), connection)
 
@@ -129,30 +131,7 @@ def local_cluster(processes: int) -> Iterator[Any]:
         yield client
 
 
-# ---- threads of this process ----
-
-
-def _run_threads(work: Work, shared: Any, tasks: list[Any], threads: int | None) -> Iterator[tuple[int, Any]]:
-    """Threads of JAX run beside each other, for they leave Python while they compute."""
-    from fits.problem.compilation import cores
-    from layerjax._numerics import broadcasting
-
-    pending, most = iter(enumerate(tasks)), threads or cores()
-    # the first by itself: it compiles the program, which keeps one core busy
-    for index, task in islice(pending, None if most == 1 else 1):
-        yield index, attempt(work, shared, task)
-    running: dict[futures.Future[Any], int] = {}
-    pool = futures.ThreadPoolExecutor(most)
-    try:  # each is begun when there is room for it: an interrupt need not wait for the others
-        while True:
-            for index, task in islice(pending, most - len(running)):
-                running[pool.submit(broadcasting(attempt), work, shared, task)] = index
-            if not running:
-                return
-            for future in futures.wait(running, return_when=futures.FIRST_COMPLETED).done:
-                yield running.pop(future), future.result()
-    finally:
-        pool.shutdown(cancel_futures=True)  # waits for the tasks that have begun
+# ---- one task ----
 
 
 def attempt(work: Work, shared: Any, task: Any) -> Any:

@@ -100,11 +100,6 @@ class Store:
         with _errors_of(path):
             return cls(path, _copied(path))
 
-    def keys(self) -> list[str]:
-        """Keys of all records, in the order in which they were written."""
-        rows = self._select("SELECT key FROM records ORDER BY number") if self.fingerprint else []
-        return list(dict.fromkeys(key for (key,) in rows if key != _WHOSE))
-
     def get(self, key: str) -> Any:
         """The record of a key, the last one of several; None without any."""
         return found[-1] if (found := self.all(key)) else None

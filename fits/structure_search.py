@@ -196,11 +196,6 @@ class Candidate:
         """The structure as words."""
         return named(self.structure)
 
-    @property
-    def parameters(self) -> int:
-        """How many are free in its fit."""
-        return len(self.fit.vector)
-
 
 @dataclass(frozen=True, eq=False)
 class Search:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fits._files import write_bytes, write_text
-from fits.cli.input_output import DONE, DOUBTFUL, hint, read_options, refuse_alone, require_place, show, use_jax
+from fits.cli.input_output import DONE, DOUBTFUL, hint, read_options, require_place, show, use_jax
 from fits.data.geometry import slices
 from fits.data.measurements import Measurements
 from fits.data.totals import Totals
@@ -96,7 +96,10 @@ def predict(arguments: Namespace) -> int:
         raise ValueError("predict needs one of --incidence and --score")
     if not scored and out is None:
         raise ValueError("predict --incidence needs --out FILE")
-    refuse_alone(arguments, ("azimuth",) if scored else ("select", "read"), "incidence" if scored else "score")
+    others, needed = (("azimuth",), "incidence") if scored else (("select", "read"), "score")
+    for name in others:
+        if getattr(arguments, name):
+            raise ValueError(f"--{name} is given without --{needed}")
     require_place(out, arguments.force, ".csv", "predictions")
     use_jax()
     from fits.prediction.predict import predict as run_prediction

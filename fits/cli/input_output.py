@@ -43,13 +43,6 @@ def read_options(arguments: Namespace) -> "ReadOptions":
     return ReadOptions.parse(arguments.read, **masks)
 
 
-def refuse_alone(arguments: Namespace, names: tuple[str, ...], needed: str) -> None:
-    """ValueError for the first of these options that is given without the one that they belong to."""
-    for name in names:
-        if getattr(arguments, name) not in (None, ()):
-            raise ValueError(f"--{name.replace('_', '-')} is given without --{needed}")
-
-
 def require_place(path: str | Path | None, force: bool, ending: str = "", what: str = "") -> None:
     """ValueError unless a file, if any, of this ending for this content can be written there, see `force`."""
     if path is not None and not str(path).lower().endswith(ending):

@@ -78,8 +78,6 @@ def warnings_in_one_line() -> Iterator[None]:
             shown.add(words)
             print(f"layerjax: warning: {words}", file=sys.stderr)
 
-    warnings.showwarning = show
-    try:
+    with warnings.catch_warnings():
+        warnings.showwarning = show
         yield
-    finally:
-        warnings.showwarning = usual

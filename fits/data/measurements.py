@@ -186,24 +186,6 @@ class Measurements(Pairs):
             channels=tuple(self.channels[column] for column in columns),
         )
 
-    def without_retro(self, degrees: float) -> "Measurements":
-        """The same samples, those closer than `degrees` (0 to 180) to retro-reflection masked.
-
-        A detector head blocks the beam there. Raises ValueError for an angle out of range.
-        """
-        _check_angle(degrees, 180.0)
-        angle = np.degrees(2 * np.arcsin(np.clip(np.linalg.norm(self.wi - self.wo, axis=-1) / 2, 0, 1)))
-        return self.where(angle >= degrees, f"masked: within {degrees:g} degrees of retro-reflection")
-
-    def without_grazing(self, degrees: float) -> "Measurements":
-        """The same samples, masked where light or viewer is more than `degrees` (0 to 90) from the normal line.
-
-        Raises ValueError for an angle out of range.
-        """
-        _check_angle(degrees, 90.0)
-        tilt = np.maximum(np.minimum(self.theta_i, 180 - self.theta_i), np.minimum(self.theta_o, 180 - self.theta_o))
-        return self.where(tilt <= degrees, f"masked: more than {degrees:g} degrees from the normal")
-
     def noted(self, *notes: str) -> "Measurements":
         """The same samples with notes added to their source."""
         return replace(self, source=replace(self.source, notes=self.source.notes + notes))
@@ -234,8 +216,3 @@ def channel_names(count: int) -> tuple[str, ...]:
     """Names for channels that have none: value, or red, green, blue, or channel1, channel2, ..."""
     known: dict[int, Sequence[str]] = {1: ("value",), 3: ("red", "green", "blue")}
     return tuple(known.get(count, [f"channel{number}" for number in range(1, count + 1)]))
-
-
-def _check_angle(degrees: float, high: float) -> None:
-    if not 0 <= degrees <= high:
-        raise ValueError(f"degrees is {degrees}, must be in [0, {high:g}]")

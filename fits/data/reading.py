@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from numbers import Real
 from pathlib import Path
 from typing import Any, Self
 
@@ -13,6 +12,7 @@ from fits.data.formats import FileOptions, read_file
 from fits.data.measurements import Measurements
 from fits.data.scans import select
 from fits.data.totals import Totals
+from layerjax._checks import require_number
 
 CHANNELS = "channels="
 READERS = ("format", "quantity", "bins", "strata", "wavelengths", "corrected")
@@ -68,9 +68,8 @@ class ReadOptions(FileOptions):
 
     def __post_init__(self) -> None:
         for name, high in (("min_retro_angle", 180.0), ("max_polar_angle", 90.0)):
-            angle = getattr(self, name)
-            if not (angle is None or (isinstance(angle, Real) and 0.0 <= float(angle) <= high)):
-                raise ValueError(f"{name} is {angle!r:.60}, must be in [0, {high:g}] degrees")
+            if (angle := getattr(self, name)) is not None:
+                require_number(name, angle, 0.0, high)
         for name in ("select", "hold_out"):
             if not isinstance(words := getattr(self, name), list | tuple):
                 raise ValueError(f"{name} is {words!r:.60}, must be a list of selections, such as ['incidence=10,50']")
@@ -109,7 +108,7 @@ class ReadOptions(FileOptions):
                     words = f"which have no outgoing direction; --{name.replace('_', '-')} does not apply"
                     raise ValueError(f"{path}: holds totals, {words}")
             return data, None
-        data = self._masked(data)
+        data = self.masked(data)
         keep, held = np.ones(len(data), bool), np.zeros(len(data), bool)
         keep = np.all([keep, *(select(data, words) for words in self.select if not words.startswith(CHANNELS))], axis=0)
         held = np.any([held, *(select(data, words) for words in self.hold_out)], axis=0)
@@ -125,12 +124,14 @@ class ReadOptions(FileOptions):
             raise ValueError("--hold-out leaves nothing to score: what it holds out is masked or not selected")
         return fitted, held_out
 
-    def _masked(self, data: Measurements) -> Measurements:
+    def masked(self, data: Measurements) -> Measurements:
         """The channels that are used, masked near retro-reflection and at grazing angles."""
-        if self.min_retro_angle is not None:
-            data = data.without_retro(self.min_retro_angle)
-        if self.max_polar_angle is not None:
-            data = data.without_grazing(self.max_polar_angle)
+        if (least := self.min_retro_angle) is not None:
+            apart = np.degrees(2.0 * np.arcsin(np.clip(np.linalg.norm(data.wi - data.wo, axis=-1) / 2.0, 0.0, 1.0)))
+            data = data.where(apart >= least, f"masked: within {least:g} degrees of retro-reflection")
+        if (most := self.max_polar_angle) is not None:  # of light and viewer, from the normal line
+            tilt = np.max([np.minimum(angle, 180.0 - angle) for angle in (data.theta_i, data.theta_o)], axis=0)
+            data = data.where(tilt <= most, f"masked: more than {most:g} degrees from the normal")
         if any(words.startswith(CHANNELS) for words in self.hold_out):
             raise ValueError("--hold-out channels: the parameters of a channel cannot be predicted from others")
         for words in self.select:

@@ -12,17 +12,15 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from numpy.typing import NDArray
 
+from fits.data.geometry import Floats, Integers
 from fits.maps.options import MapOptions
 from fits.maps.search import fit_first, fit_pilot_texels
-from fits.maps.texels import Fits, Integers, Texels, fit_texels, held_by_bounds, widths, with_own_directions
+from fits.maps.texels import Fits, Texels, fit_texels, widths, with_own_directions
 from fits.optimise.multi_start import start_points
-from fits.optimise.uncertainty import LARGEST_ERROR, UNKNOWN_BEYOND
+from fits.optimise.uncertainty import LARGEST_ERROR, UNKNOWN_BEYOND, held_by_bounds
 from fits.problem.parameters import is_free
 from fits.problem.problem import Problem, unit
-
-Floats = NDArray[np.float64]
 
 MOST_ROUNDS, HALVINGS = 30, 8  # Gauss-Newton steps, and how often one that does not help is halved
 

@@ -17,18 +17,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from numpy.polynomial.chebyshev import chebpts1
 from numpy.typing import NDArray
 from scipy import fft
 from scipy.stats import qmc
 
+from fits.data.geometry import Floats, Integers, Truths
 from fits.maps.options import DEFAULT, MapOptions
 from fits.problem.compilation import cores, in_shares
 from fits.problem.model import Model
 from fits.problem.problem import Problem
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
-Truths = NDArray[np.bool_]
 
 CORNERS, LINE_NODES, CHECKS, ROUNDS = 12, 33, 64, 3
 """Lines through the box beside its middle, nodes on each, points that are checked, and emulators tried."""
@@ -79,6 +77,10 @@ class Emulator(eqx.Module):
         """What `of` takes."""
         return {one.name: np.asarray(getattr(self, one.name)) for one in fields(self) if one.name != "highest"}
 
+    def predict(self, model: Model, vector: Array) -> Array:
+        """Scaled BSDF of a model, (N, C), in 1/sr."""
+        return model.build(vector).scale * self.values(vector)
+
     def values(self, vector: Array) -> Array:
         """BSDF of the data, (N, C), in 1/sr, with these parameters (P,)."""
 
@@ -100,21 +102,6 @@ def chebyshev(x: Array, count: int) -> Array:
     for _ in range(2, count):
         basis.append(2.0 * x * basis[-1] - basis[-2])
     return jnp.stack(basis[:count])
-
-
-class EmulatedModel(Model):
-    """A model whose values come from an emulator in the place of its transport."""
-
-    emulator: Emulator
-
-    def predict(self, vector: Array) -> Array:
-        """Scaled BSDF, (N, C), in 1/sr."""
-        return self.build(vector).scale * self.emulator.values(vector)
-
-
-def with_emulator(model: Model, emulator: Emulator) -> EmulatedModel:
-    """The model with the emulator."""
-    return EmulatedModel(**{one.name: getattr(model, one.name) for one in fields(Model)}, emulator=emulator)
 
 
 # ---- how it is made ----
@@ -200,7 +187,7 @@ def _places(problem: Problem) -> Integers | str:
 def _needed_terms(space: _Space, tolerance: float) -> tuple[tuple[int, ...], Floats]:
     """How many terms each coordinate needs, `LINE_NODES` where fewer do not suffice, and the offset (N, C), by lines
     through the middle of the box and some of its corners, near which series are worst."""
-    count, nodes = len(space.low), _nodes(LINE_NODES)
+    count, nodes = len(space.low), chebpts1(LINE_NODES)[::-1]
     corners = np.random.default_rng(0).permuted(np.arange(2**count))[:CORNERS]
     through = np.concatenate([np.zeros((1, count)), 2.0 * (corners[:, None] >> np.arange(count) & 1) - 1.0])
     lines = np.broadcast_to(through[None, :, None], (count, len(through), LINE_NODES, count)).copy()
@@ -218,11 +205,6 @@ def _needed_terms(space: _Space, tolerance: float) -> tuple[tuple[int, ...], Flo
     return tuple(max(2, int(one)) for one in terms), offset
 
 
-def _nodes(count: int) -> Floats:
-    """Zeros of a Chebyshev polynomial."""
-    return np.cos(np.pi * (np.arange(count) + 0.5) / count)
-
-
 def _series(values: Floats, axis: int) -> Floats:
     """Coefficients of Chebyshev series along an axis from values at the polynomial's zeros."""
     coefficients = np.asarray(fft.dct(values, type=2, axis=axis)) / values.shape[axis]
@@ -232,7 +214,7 @@ def _series(values: Floats, axis: int) -> Floats:
 
 def _make(space: _Space, terms: tuple[int, ...], offset: Floats, tolerance: float) -> Emulator:
     orders = np.indices(terms).reshape(len(terms), -1).T
-    nodes = np.stack([_nodes(count)[order] for count, order in zip(terms, orders.T, strict=True)], axis=1)
+    nodes = np.stack([chebpts1(count)[::-1][order] for count, order in zip(terms, orders.T, strict=True)], axis=1)
     values, sigma = space.values(nodes)
     smallest = np.max(np.abs(values), axis=0) * np.finfo(float).tiny + np.finfo(float).tiny
     logarithms = np.log(np.maximum(values + offset, smallest))  # (G, N, C)

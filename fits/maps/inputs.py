@@ -16,11 +16,10 @@ import h5py
 import numpy as np
 import xarray as xr
 import zarr
-from numpy.typing import NDArray
 
 from fits._files import require_there
 from fits.data.formats.csv import read_directions
-from fits.data.geometry import Floats, Geometry, Pairs, direction
+from fits.data.geometry import Floats, Geometry, Pairs, Truths, direction
 from fits.engines import one_line
 from fits.store import fingerprint
 
@@ -169,7 +168,7 @@ class Measured(NamedTuple):
 
     values: Floats
     sigma: Floats | None
-    mask: NDArray[np.bool_]
+    mask: Truths
     wi: Floats | None
     wo: Floats | None
 
@@ -220,7 +219,7 @@ class MapData:
             wi, wo = _unit_vectors(directions, mask, f" in block {block_words(block)}")
         return Measured(self._expanded(self.values, block), sigma, mask, wi, wo)
 
-    def read_mask(self, block: Block) -> NDArray[np.bool_]:
+    def read_mask(self, block: Block) -> Truths:
         """Which texels of a block take part: all if there is no mask."""
         if self.mask is None:
             return np.ones([one.stop - one.start for one in block], bool)
@@ -329,7 +328,7 @@ def _directions(geometry: Any, arrays: Arrays) -> Arrays:
     return {name: arrays[name] for name in names}
 
 
-def _unit_vectors(directions: Mapping[str, Floats], used: NDArray[np.bool_], where: str) -> tuple[Floats, Floats]:
+def _unit_vectors(directions: Mapping[str, Floats], used: Truths, where: str) -> tuple[Floats, Floats]:
     """`wi` and `wo`, (block shape, N, 3), refused where one of a `used` texel is none, along the normal elsewhere."""
     if "wi" not in directions:
         for name in ("theta_i", "theta_o"):

@@ -9,15 +9,13 @@ from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any
 
-import jax
 import numpy as np
-from jax import Array
-from numpy.typing import NDArray
 
 import layerjax as lj
+from fits.data.geometry import Floats, Truths
 from fits.data.measurements import Measurements, channel_names
 from fits.maps.common import fit_common, with_common
-from fits.maps.emulator import Emulator, emulate, with_emulator
+from fits.maps.emulator import Emulator, emulate
 from fits.maps.inputs import Block, MapData, Measured
 from fits.maps.options import MapOptions
 from fits.maps.search import Starts, fit_pilot_texels, reduced_chi_square, sigmas, starts_at
@@ -26,14 +24,12 @@ from fits.maps.texels import Fits, Texels, make_texels, with_own_directions
 from fits.optimise.fit import fit
 from fits.optimise.multi_start import start_points
 from fits.optimise.resolution import has_rays, leaves_rays_open, resolution_in_words, resolutions
-from fits.problem.model import Model
-from fits.problem.noise import DEFAULT_FLOOR, DEFAULT_RELATIVE, Noise
-from fits.problem.parameters import Free, is_free
+from fits.problem.model import predict_each
+from fits.problem.noise import Noise, noise_levels
+from fits.problem.parameters import is_free
 from fits.problem.problem import Problem
 from fits.problem.stack_file import transport_from_dict, transport_to_dict
 from fits.progress import silent
-
-Floats = NDArray[np.float64]
 
 GOLDEN, MOST_TRIED = 0.6180339887498949, 4096
 """Steps between the texels that are tried for a pilot, as a share of the map, and how many are."""
@@ -69,29 +65,23 @@ class Job:
         """The store, opened once in each process."""
         return Store(self.path)
 
-    def texels(self, block: Block) -> tuple[NDArray[np.bool_], Texels]:
+    def texels(self, block: Block) -> tuple[Truths, Texels]:
         """Which texels of a block take part, (block shape), and those of the block, one after the other."""
         measured = self.data.read(block)
-        return measured.mask, texels_of(measured, least_floor(self.prototype))
+        return measured.mask, texels_of(measured)
 
 
 def map_problem(problem: Problem, own_directions: bool, emulator: Emulator | None) -> Problem:
     """A problem with the model of a map; own_directions: of each texel."""
     problem = with_own_directions(problem) if own_directions else problem
-    return problem if emulator is None else problem.with_model(with_emulator(problem.model, emulator))
+    return problem if emulator is None else problem.with_model(replace(problem.model, stand_in=emulator))
 
 
-def least_floor(problem: Problem) -> float:
-    """The least that the floor of the noise can be, in 1/sr."""
-    floor = problem.noise.floor
-    return float(floor.arrays()[1]) if isinstance(floor, Free) else float(floor or 0.0)
-
-
-def texels_of(measured: Measured, floor: float) -> Texels:
-    """The texels of a block, one after the other; floor: the least of the noise's, in 1/sr."""
+def texels_of(measured: Measured) -> Texels:
+    """The texels of a block, one after the other."""
     rank = measured.mask.ndim
     values, sigma, _, wi, wo = (None if one is None else one.reshape(-1, *one.shape[rank:]) for one in measured)
-    return make_texels(values, sigma, floor, wi, wo)  # type: ignore[arg-type]
+    return make_texels(values, sigma, wi, wo)  # type: ignore[arg-type]
 
 
 # ---- which texels, and a problem for them ----
@@ -106,7 +96,7 @@ def pilot_texels(data: MapData, count: int) -> Texels:
     chosen: dict[int, Texels] = {}
     for place in dict.fromkeys(order.tolist()):
         at = np.unravel_index(place, data.shape)
-        row = texels_of(data.read(tuple(slice(int(one), int(one) + 1) for one in at)), 0.0)
+        row = texels_of(data.read(tuple(slice(int(one), int(one) + 1) for one in at)))
         if row.measurements[0]:
             chosen[place] = row
         if len(chosen) == count:
@@ -135,16 +125,11 @@ def make_prototype(
     typical = int(np.argsort(bright)[len(bright) // 2])
     values = np.where(pilot.used[typical], pilot.values[typical], median(pilot.values))
     sigma = np.sqrt(median(pilot.variance)) if noise.use_sigma and data.sigma is not None else None
-    relative, floor = noise.relative, noise.floor
-    if relative is None:
-        relative = DEFAULT_RELATIVE if sigma is None and floor is None else 0.0
-    if floor is None:  # one for the whole map
-        none = not is_free(relative) and relative == 0
-        floor = 0.0 if none else DEFAULT_FLOOR * float(np.median(np.abs(pilot.values[pilot.used])))
     view = data.geometry
     wi, wo = (pilot.wi[typical], pilot.wo[typical]) if view is None else (view.wi, view.wo)
     measured = Measurements(wi, wo, values, sigma, np.ones(len(values), bool), channel_names(data.channels))
-    noise = replace(noise, relative=relative, floor=floor, discrepancy=False)
+    levels = noise_levels(noise, measured, pilot.values[pilot.used])  # one floor for the whole map
+    noise = replace(noise, relative=levels.relative, floor=levels.floor, discrepancy=False)
     problem = Problem(stack, measured, transport=transport, noise=noise, **options.model)
 
     names, common, prior = problem.names, problem.common_names, options.spatial_prior
@@ -174,7 +159,7 @@ def fit_pilot(
     """Resolution, emulator, common parameters and starts, from the pilot texels of a map of this shape: the arrays that
     a store keeps of them, and what its root says. ValueError: there is no emulator that is required, or no fit."""
     own_directions = texels.wi is not None
-    texels = texels.rows(texels.measurements >= len(problem.names)).with_floor(least_floor(problem))
+    texels = texels.rows(texels.measurements >= len(problem.names))
 
     # the resolution that a fit of its own data ends with
     known = resolutions(problem)
@@ -251,16 +236,7 @@ def _numerical_error(ready: Problem, fine: Problem, fits: Fits, texels: Texels) 
     """Largest numerical error of the pilot, in standard deviations, by a finer problem."""
     good = np.isfinite(fits.cost)
     fits, texels = fits.rows(good), texels.rows(good)
-    exact = predict_all(fine, fits.vector)
+    exact = np.asarray(fine.call(predict_each, fits.vector), float)
     own = np.where(texels.used, np.sqrt(texels.variance), 0.0)
     error = np.abs(fits.predicted - exact) / np.hypot(sigmas(ready, fits.vector, exact), own)
     return float(np.max(np.where(texels.used, error, 0.0), initial=0.0))
-
-
-def predict_all(problem: Problem, vectors: Floats) -> Floats:
-    """What vectors (K, P) predict, (K, N, C), in 1/sr."""
-    return np.asarray(problem.call(_predict_all, vectors), float)
-
-
-def _predict_all(model: Model, vectors: Array) -> Array:
-    return jax.lax.map(model.predict, vectors)

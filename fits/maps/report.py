@@ -18,8 +18,9 @@ from matplotlib.patches import Patch
 from scipy.stats import chi2
 
 from fits._files import write_text
+from fits.data.geometry import Floats
 from fits.maps.options import MapOptions
-from fits.maps.store import FLAGS, FittedMap, Floats
+from fits.maps.store import FLAGS, FittedMap
 from fits.progress import Progress, silent
 from fits.reports.pages import Table, document, html_table, image, made_with, section
 from fits.reports.pages import verdict as verdict_box

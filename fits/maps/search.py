@@ -9,15 +9,13 @@ from dataclasses import dataclass
 import jax
 import numpy as np
 from jax import Array
-from numpy.typing import NDArray
 from scipy import stats
 
+from fits.data.geometry import Floats, Integers, Truths
 from fits.maps.options import MapOptions
-from fits.maps.texels import Fits, Integers, Linearisation, Texels, fit_texels, linearise_at, to_units
+from fits.maps.texels import Fits, Linearisation, Texels, fit_texels, linearise_at, to_units
 from fits.problem.model import Model
 from fits.problem.problem import Problem
-
-Floats = NDArray[np.float64]
 
 FIRST = 8  # texels of the pilot that are fitted from all starts; the rest of it begins where these ended
 
@@ -61,9 +59,7 @@ def fit_pilot_texels(problem: Problem, points: Floats, texels: Texels, options: 
     return search(problem, starts, texels, options)[0]
 
 
-def search(
-    problem: Problem, starts: Starts, texels: Texels, options: MapOptions
-) -> tuple[Fits, NDArray[np.bool_], NDArray[np.bool_]]:
+def search(problem: Problem, starts: Starts, texels: Texels, options: MapOptions) -> tuple[Fits, Truths, Truths]:
     """The fits of M texels, and which of them are poor or were fitted again, (M,) each."""
     size = options.chunk_size
     order = likeliest(problem, starts, texels, size, options.restarts + 1)
@@ -77,7 +73,7 @@ def search(
         freedom = np.maximum(texels.measurements - len(problem.names), 1)
         limit = np.maximum(starts.explained, stats.chi2.isf(options.poor_probability, freedom) / freedom)
 
-    def poor() -> NDArray[np.bool_]:
+    def poor() -> Truths:
         """Which fits are worse than noise and pilot explain, or have not converged."""
         return ~((reduced_chi_square(best, texels) <= limit) & best.converged)
 

@@ -14,18 +14,15 @@ from contextlib import suppress
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fits._files import plain
+from fits.data.geometry import Floats, Truths
 from fits.engines import Failure, run
 from fits.maps.inputs import Block, block_words
 from fits.maps.options import Kind, MapOptions
 from fits.maps.pilot import Job
 from fits.maps.store import FLAGS, SMOOTHED, Store, blocks_of
 from fits.maps.texels import fit_texels, standard_errors, to_units, widths
-
-Floats = NDArray[np.float64]
-Truths = NDArray[np.bool_]
 
 FLAT = 0.1  # of the scale: below, a difference counts by its square in a total variation, which has no derivative at 0
 

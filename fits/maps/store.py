@@ -25,12 +25,11 @@ from zarr.core.sync import sync
 
 from fits._files import PARTIAL, given_path, named, plain, replacing, require_there, restore
 from fits._lazy import shown_by
+from fits.data.geometry import Floats, Truths
 from fits.engines import one_line
 from fits.maps.inputs import Block
 from fits.maps.options import MapOptions
 from fits.store import another, differences
-
-Floats = NDArray[np.float64]
 
 KEY, KIND, FORMAT = "layerjax", "fitted map", 6
 PILOT, SMOOTHED = "pilot", "smoothed"
@@ -174,7 +173,7 @@ class FittedMap:
         """The share of texels that are there."""
         return float(np.mean(self.flags != 0))
 
-    def has(self, meaning: str) -> NDArray[np.bool_]:
+    def has(self, meaning: str) -> Truths:
         """Which texels have a flag.
 
         Args:

@@ -17,18 +17,14 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jax.flatten_util import ravel_pytree
-from numpy.typing import NDArray
 
+from fits.data.geometry import Floats, Integers, Truths
 from fits.optimise.levenberg_marquardt import COST_TOLERANCE, FIRST_DAMPING, NEARBY, State, first_state
 from fits.optimise.levenberg_marquardt import step as step_of
 from fits.optimise.multi_start import MOST_STEPS
-from fits.optimise.uncertainty import LARGEST_ERROR, LEAST_GRADIENT, ON_BOUND, UNIDENTIFIED_BEYOND, UNKNOWN_BEYOND
-from fits.problem.model import Linearisation, Model, linear, linearise
+from fits.optimise.uncertainty import LEAST_GRADIENT, UNIDENTIFIED_BEYOND, errors_in_boxes, scatter
+from fits.problem.model import Linearisation, Model, linearise
 from fits.problem.problem import Problem
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
-Truths = NDArray[np.bool_]
 
 OMITTED = 1e9  # standard deviation of a value that is omitted, in units of the largest: it weighs less than rounding
 
@@ -46,15 +42,13 @@ KNOWN = 64  # starts whose linearisation a program takes, or a multiple of that,
 class Texels(NamedTuple):
     """Measurements of M texels.
 
-    values, variance, lowest: (M, N, C), BSDF in 1/sr, the measurement's own variance, enormous for what is omitted,
-    and what sigma cannot fall below. used: (M, N, C) bool. wi, wo: (M, N, 3), None where all texels have the directions
-    of the problem. centre, inverse_sd: (M, P), of Gaussian priors beside those of the problem, in the unit box; None
-    where there are none.
+    values, variance: (M, N, C), BSDF in 1/sr and the measurement's own variance, enormous for what is omitted. used:
+    (M, N, C) bool. wi, wo: (M, N, 3), None where all texels have the directions of the problem. centre, inverse_sd:
+    (M, P), of Gaussian priors beside those of the problem, in the unit box; None where there are none.
     """
 
     values: Any
     variance: Any
-    lowest: Any
     used: Any
     wi: Any = None
     wo: Any = None
@@ -71,24 +65,19 @@ class Texels(NamedTuple):
         return Texels(*(None if part is None else part[places] for part in self))
 
     @property
-    def measurements(self) -> NDArray[np.int64]:
+    def measurements(self) -> Integers:
         """How many of each texel count, (M,)."""
         return np.sum(self.used, axis=(1, 2))
-
-    def with_floor(self, least: float) -> "Texels":
-        """The same with noise whose floor is at least so much, in 1/sr."""
-        return self._replace(lowest=np.sqrt(self.variance + least**2))
 
 
 def make_texels(
     values: Floats,
     sigma: Floats | None = None,
-    least: float = 0.0,
     wi: Floats | None = None,
     wo: Floats | None = None,
 ) -> Texels:
     """Values (M, N, C), with their standard deviations of that shape; what is not finite is omitted, in single
-    precision also what is finite only in double. least: of the noise's floor.
+    precision also what is finite only in double.
     """
     largest_number = float(jnp.finfo(jnp.result_type(float)).max)
     used, variance = np.abs(values) <= largest_number, np.zeros(values.shape)
@@ -99,12 +88,12 @@ def make_texels(
         largest = np.max(np.abs(values), initial=0.0, where=used, axis=(1, 2), keepdims=True)
         ignored = np.minimum(np.square(OMITTED * np.where(largest > 0.0, largest, 1.0)), 0.25 * largest_number)
     variance = np.where(used, variance, ignored)
-    return Texels(np.where(used, values, 0.0), variance, variance, used, wi, wo).with_floor(least)
+    return Texels(np.where(used, values, 0.0), variance, used, wi, wo)
 
 
 def model_of(model: Model, row: Texels) -> Model:
     """The model with the measurements of one texel, (N, C), and the priors that it has beside those of the problem."""
-    model = eqx.tree_at(lambda m: (m.values, m.variance, m.lowest), model, (row.values, row.variance, row.lowest))
+    model = eqx.tree_at(lambda m: (m.values, m.variance), model, (row.values, row.variance))
     if row.wi is not None:
         model = eqx.tree_at(lambda m: (m.wi, m.wo), model, (row.wi, row.wo))
     if row.centre is None:
@@ -205,37 +194,21 @@ def widths(problem: Problem, vectors: Floats) -> Floats:
     return np.asarray(problem.model.box.slope(jnp.asarray(vectors)), float)
 
 
-def held_by_bounds(unit: Floats, gradient: Floats, least: Any = LEAST_GRADIENT) -> Truths:
-    """Which parameters lie on a bound of the unit box and would go beyond it; least: gradient that counts."""
-    return ((unit <= ON_BOUND) & (gradient > least)) | ((unit >= 1.0 - ON_BOUND) & (gradient < -least))
-
-
 def standard_errors(problem: Problem, fits: Fits, texels: Texels) -> tuple[Floats, Truths, Truths]:
     """As `fits.optimise.uncertainty`, of M fits: standard errors (M, P), NaN where a bound holds the parameter and
     infinite where nothing does; which are at a bound, (M, P); in which texels the data leave a parameter unidentified,
     (M,)."""
-    count = fits.unit.shape[1]
-    scatter = np.ones((len(fits.cost), 1))  # what a difference in cost is measured in
-    if problem.objective != "likelihood":
-        freedom = np.maximum(texels.measurements - count, 1)
-        scatter = np.maximum(2.0 * fits.cost / freedom, np.finfo(float).tiny)[:, None]
-    root, known = fits.root / np.sqrt(scatter)[..., None], fits.finite & np.isfinite(fits.root).all((1, 2))
-    root = np.where(known[:, None, None], root, 0.0)
-    insensitive = np.linalg.norm(root, axis=1) * UNKNOWN_BEYOND < 1.0
-    at_bound = held_by_bounds(fits.unit, fits.gradient, LEAST_GRADIENT * scatter) & ~insensitive & known[:, None]
-    unidentified = (np.linalg.svd(root, compute_uv=False)[:, -1] < 1.0 / UNIDENTIFIED_BEYOND) | ~known
+    known = (fits.finite & np.isfinite(fits.root).all((1, 2)))[:, None]
+    unit_cost = scatter(problem, fits.cost, texels.measurements)[:, None].astype(fits.root.dtype)
+    root = np.where(known[..., None], fits.root, 0.0) / np.sqrt(unit_cost)[..., None]
+    unidentified = (np.linalg.svd(root, compute_uv=False)[:, -1:] < 1.0 / UNIDENTIFIED_BEYOND) | ~known
     prior = np.asarray(problem.model.box.prior_slopes())
     prior = prior[prior.any(axis=1)]
     prior = np.broadcast_to(prior, (len(root), *prior.shape))
     if texels.inverse_sd is not None:
-        prior = np.concatenate([prior, texels.inverse_sd[:, :, None] * np.eye(count)], axis=1)
-    rows = np.where(at_bound[:, None], 0.0, np.concatenate([root, prior], axis=1))
-    _, sizes, directions = np.linalg.svd(rows, full_matrices=False)
-    least = np.maximum(np.finfo(fits.root.dtype).eps * count * sizes[:, :1], 1.0 / LARGEST_ERROR)
-    spread = np.linalg.norm(directions / np.maximum(sizes, least)[..., None], axis=1)
-    errors = spread * widths(problem, fits.vector)
-    errors = np.where((spread > UNKNOWN_BEYOND) | ~known[:, None], np.inf, errors)
-    return np.where(at_bound, np.nan, errors), at_bound, unidentified
+        prior = np.concatenate([prior, texels.inverse_sd[:, :, None] * np.eye(root.shape[2])], axis=1)
+    _, at_bound, _, errors = errors_in_boxes(root, prior, fits.unit, fits.gradient, LEAST_GRADIENT * unit_cost)
+    return np.where(known, errors * widths(problem, fits.vector), np.inf), at_bound, unidentified[:, 0]
 
 
 # ---- the program ----
@@ -253,9 +226,9 @@ def _run(
     most_steps: int,
 ) -> tuple[Fits, Linearisation]:
     """Fits of M texels, so many at a time; and the model where the first `KNOWN` of each share ended."""
-    shape, parts = problem.model.values.shape, []
+    shape, moving, parts = problem.model.values.shape, problem.model.moving, []
     if known is None and texels.wi is None:
-        known = Linearisation(np.zeros((1, *shape)), np.zeros((1, units.shape[1], *shape)))
+        known = Linearisation(np.zeros((1, *shape)), np.zeros((1, moving, *shape)), np.zeros((1, moving)))
     if known is not None:  # few numbers of starts, and of programs for them
         known = Linearisation(*(np.concatenate([one, np.repeat(one[-1:], -len(one) % KNOWN, axis=0)]) for one in known))
     for first in range(0, texels.number, share):
@@ -313,7 +286,7 @@ def _program(
 
     # lanes take their steps, and one whose texel has ended the next texel
     def tried(run: _Descent, row: Texels) -> Linearisation:
-        return _linearise(model_of(model, row), model.box.from_unit(run.state.trial))
+        return linearise(model_of(model, row), model.box.from_unit(run.state.trial))
 
     def body(carry: tuple[Any, ...]) -> tuple[Any, ...]:
         following, lanes, runs, rows = carry
@@ -358,32 +331,24 @@ def first_mapped(one: Callable[[Any], Any], rows: Any, number: Array, otherwise:
     return jax.tree.map(lambda part: part.reshape(-1, *part.shape[2:]), found)
 
 
-def _linearise(model: Model, vector: Array) -> Linearisation:
-    """Values at a vector (P,), and slopes by all parameters."""
-    values, slopes = linearise(model, vector)
-    rest = jnp.zeros((vector.size - model.moving, *values.shape), values.dtype)
-    return Linearisation(values, jnp.concatenate([slopes, rest]))
-
-
 def _begin(model: Model, fresh: Array, start: tuple[Array, Texels]) -> _Descent:
     """A texel at its start (P,), before the first step."""
     unit, own = start[0], model_of(model, start[1])
     levels = model.objective == "likelihood" and model.varying
-    nothing = jnp.zeros((unit.size, *own.values.shape), unit.dtype)
-    state = first_state(unit, jnp.where(fresh, FIRST_DAMPING, NEARBY), Linearisation(nothing[0], nothing))
+    state = first_state(unit, jnp.where(fresh, FIRST_DAMPING, NEARBY), own.nothing_known[0])
     sigma, no = own.initial_sigma(model.box.from_unit(unit)) if levels else jnp.zeros(0), jnp.asarray(False)
     return _Descent(fresh & levels, sigma, state, no, no)
 
 
 def _step(model: Model, fresh: Array, most_steps: Array, run: _Descent, row: Texels, trial: Linearisation) -> _Descent:
     """A texel after a step by what is known of its trial."""
-    own = linear(model_of(model, row), trial, model.box.from_unit(run.state.trial))
+    own = model_of(model, row).linearised([trial])
     likelihood = model.objective == "likelihood"
     levels = likelihood and model.varying
     first_step = (jnp.where(run.rough, run.sigma, jnp.nan), jnp.ones(())) if levels else None
 
-    def residuals(unit: Array) -> tuple[Any, Linearisation]:
-        return own.linear_parts(model.box.from_unit(unit), first_step)[0], trial
+    def residuals(unit: Array) -> tuple[Any, Linearisation, None]:
+        return own.linear_parts(model.box.from_unit(unit), first_step)[0], trial, None
 
     first = run.state.steps == 0
     tolerance, logarithmic = COST_TOLERANCE if likelihood else None, model.logarithmic if levels else ()
@@ -398,8 +363,9 @@ def _step(model: Model, fresh: Array, most_steps: Array, run: _Descent, row: Tex
     full = state.full_decrease - state.predicted <= LAST * COST_TOLERANCE
     last = ~stop & ~run.rough & followed & full & jnp.isfinite(run.state.full_decrease)
     last &= likelihood
-    moved = model.box.from_unit(state.trial) - model.box.from_unit(state.point)
-    near = state.auxiliary._replace(values=state.auxiliary.values + jnp.tensordot(moved, state.auxiliary.slopes, 1))
+    vector = model.box.from_unit(state.trial)
+    values = state.auxiliary.predict(model, vector)
+    near = state.auxiliary._replace(values=values, at=vector[: model.moving])
     gradient, cost = state.gradient + state.normal @ (state.trial - state.point), state.cost - state.predicted
     after = replace(state, point=state.trial, cost=cost, gradient=gradient, auxiliary=near)
     state = jax.tree.map(partial(jnp.where, last), after, state)
@@ -415,7 +381,7 @@ def _results(model: Model, run: _Descent, row: Texels) -> Fits:
     """What is known where a texel ended."""
     own, unit, cost = model_of(model, row), run.state.point, run.state.cost
     vector, predicted, finite = model.box.from_unit(unit), run.state.auxiliary.values, jnp.isfinite(cost)
-    near = linear(own, run.state.auxiliary, vector)
+    near = own.linearised([run.state.auxiliary])
     rows = jax.jacfwd(lambda unit: near.linear_parts(model.box.from_unit(unit))[1][1])(unit)
     misfit = jnp.where(row.used, own.standardised_at(vector, predicted), 0.0)
     return Fits(

@@ -40,7 +40,7 @@ from fits.problem.model import Transport
 from fits.problem.noise import Noise
 from fits.problem.parameters import Free
 from fits.problem.problem import FittingProblem, Problem
-from fits.progress import Progress, given_progress, silent
+from fits.progress import Progress, given_progress, named, silent
 from layerjax._checks import require_count, require_kind, require_seed
 from layerjax.compiling import programs_kept
 
@@ -116,11 +116,8 @@ def fit(
         points.append(unit_of(whole, np.array([values[name] for name in whole.names])))
     others = start_points(whole, min(starts, MOST_STARTS // 2), seed)
 
-    def progress_again(stage: str, done: int, total: int | None = None, info: str = "") -> None:
-        run.progress(f"{stage} with model discrepancy", done, total, info)
-
     checkpoint = None if checkpoint is None else discrepancy_checkpoint(checkpoint)
-    again = run._replace(progress=progress_again, checkpoint=checkpoint)
+    again = run._replace(progress=named("with model discrepancy", run.progress), checkpoint=checkpoint)
     return _fit_from(whole, np.concatenate([points, others]), again, without)
 
 
@@ -193,8 +190,6 @@ def _result(at: Optimum, accuracy: Accuracy | None, run: _Run, without: Mapping[
     problem, lowest, found, options = at.problem, at.lowest, at.uncertainty, run.options
     at_bound = tuple(name for name, held in zip(problem.names, found.at_bound, strict=True) if held)
     minima, outcomes = _minima(problem, at, options)
-    equivalent = options.equivalent_cost * at.excess
-    alternatives = tuple(minimum for minimum in minima[1:] if minimum.cost - lowest.cost < equivalent)
     result = Fit(
         problem=cast(Problem, problem),  # or a `Joint`, of whose data sets `Fit.part` says more
         vector=lowest.vector,
@@ -208,7 +203,6 @@ def _result(at: Optimum, accuracy: Accuracy | None, run: _Run, without: Mapping[
         unidentified=found.unidentified,
         insensitive=found.insensitive,
         minima=minima,
-        alternatives=alternatives,
         settings={"starts": run.starts, "seed": run.seed, **asdict(options)},
         start_outcomes=outcomes,
         numerical_error=None if accuracy is None else accuracy.error,
@@ -259,6 +253,7 @@ def _minima(problem: FittingProblem, at: Optimum, options: FitOptions) -> tuple[
             values=dict(zip(problem.names, map(float, ends[leader].vector), strict=True)),
             cost=float(cost[leader]),
             count=count,
+            equivalent=leader != leaders[0] and bool(cost[leader] - cost[best] < options.equivalent_cost * at.excess),
         )
         for leader, count in zip(leaders, counts, strict=True)
     )

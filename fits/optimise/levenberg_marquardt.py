@@ -1,12 +1,12 @@
-"""Levenberg-Marquardt within a box, on the normal equations, as an optimistix solver; and through a model.
+"""Levenberg-Marquardt within a box, on the normal equations; and through a model.
 
-optimistix has no bounds, and a transform to an unconstrained space sends a parameter whose best value lies on its bound
-to infinity, where gradients vanish. Here the iterate stays in the box: parameters that push against a bound are held
-there, the others take a damped Gauss-Newton step, and what would leave the box is put on its face (projected
-Levenberg-Marquardt, Kanzow, Yamashita and Fukushima 2004). The few columns of the Jacobian are carried forward together
-and only J'J and J'r are kept, which is several times faster than a QR decomposition of J when there are many more
-residuals than parameters. Columns are scaled to unit length first, so that units do not matter to the damping (after
-Marquardt 1963; its update after Nielsen 1999).
+A transform to an unconstrained space would send a parameter whose best value lies on its bound to infinity, where
+gradients vanish. Here the iterate stays in the box: parameters that push against a bound are held there, the others
+take a damped Gauss-Newton step, and what would leave the box is put on its face (projected Levenberg-Marquardt,
+Kanzow, Yamashita and Fukushima 2004). The few columns of the Jacobian are carried forward together and only J'J and
+J'r are kept, which is several times faster than a QR decomposition of J when there are many more residuals than
+parameters. Columns are scaled to unit length first, so that units do not matter to the damping (after Marquardt 1963;
+its update after Nielsen 1999).
 
 To compile the Jacobian of a costly transport takes longer than most fits take to run. So it is a program by itself,
 which fits with and without discrepancy share, and the others see the model as linear at a trial (`Problem.linearise`).
@@ -20,7 +20,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
 from jax import Array
 
 from fits.data.geometry import Floats
@@ -46,7 +45,7 @@ class State(eqx.Module):
     """Where a descent in the unit box [0, 1]^P has come to after `steps` trials.
 
     point: (P,), the best so far, with what is known there: cost, gradient (P,) and normal matrix (P, P), the auxiliary
-    output of the residuals, and the Jacobian of what is watched of it, a leading axis for the parameters.
+    output of the residuals, and the Jacobian of what is watched, a leading axis for the parameters.
     trial: (P,), what is tried next, to gain `predicted` in the cost; full_decrease: more cannot be gained.
     ended: nothing is left to gain, or no step gains anything; failed: no step does though something is left, or the
     start has residuals that are not finite.
@@ -90,23 +89,22 @@ def first_state(point: Array, damping: Array, auxiliary: Any, watched: Any = Non
 
 
 def step(
-    residuals: Callable[[Array], tuple[Any, Any]],
+    residuals: Callable[[Array], tuple[Any, Any, Any]],
     state: State,
     tolerance: Array | float | None = None,
     logarithmic: tuple[int, ...] = (),
-    watch: Callable[[Any], Any] = lambda auxiliary: None,
 ) -> State:
     """Evaluate the trial, accept or refuse it, and propose the next one.
 
-    residuals: of a point, a tree of arrays, half whose sum of squares is the cost; and an auxiliary output.
+    residuals: of a point, a tree of arrays, half whose sum of squares is the cost; an auxiliary output; and one whose
+        Jacobian is kept, or None.
     tolerance: it ends when a full Gauss-Newton step is predicted to gain less; None: `RELATIVE_TOLERANCE` of the cost.
     logarithmic: places among the leaves of the residuals of those that have logarithms L of noise levels as half their
         squares: dL'dL takes the place of their J'J, which makes the sum the Fisher information (J'J alone would
         overshoot up to twofold at every step).
-    watch: picks the part of the auxiliary output whose Jacobian is kept.
     """
     first = state.steps == 0
-    at_trial = _normal_equations(residuals, state.trial, logarithmic, watch)
+    at_trial = _normal_equations(residuals, state.trial, logarithmic)
     cost, gradient, normal = at_trial[:3]
     finite = jnp.isfinite(cost) & jnp.all(jnp.isfinite(gradient)) & jnp.all(jnp.isfinite(normal))
     ratio = (state.cost - cost) / jnp.where(state.predicted > 0, state.predicted, 1.0)
@@ -147,61 +145,14 @@ def step(
     )
 
 
-class BoxLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
-    """`step` as a solver of optimistix, for vectors in the unit box.
-
-    Its options are the arguments of `step`, "damping" at the start, and "most_steps". A start that is not finite, or a
-    stall away from a minimum, gives `optx.RESULTS.nonlinear_divergence`. Statistics have the last `State` as "state".
-    """
-
-    rtol: float = RELATIVE_TOLERANCE
-    atol: float = 0.0
-    norm: Callable[[Any], Array] = optx.max_norm
-
-    def init(self, fn: Any, y: Array, args: Any, options: Any, f_struct: Any, aux_struct: Any, tags: Any) -> State:
-        """State before the first evaluation."""
-        auxiliary = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), aux_struct)
-        watched = _watch(options)(auxiliary)
-        watched = jax.tree.map(lambda leaf: jnp.zeros((y.size, *leaf.shape), leaf.dtype), watched)
-        return first_state(y, options.get("damping", FIRST_DAMPING), auxiliary, watched)
-
-    def step(self, fn: Any, y: Array, args: Any, options: Any, state: State, tags: Any) -> tuple[Array, State, Any]:
-        """One evaluation, at the trial."""
-        tolerance, logarithmic = options.get("tolerance"), options.get("logarithmic", ())
-        state = step(lambda z: fn(z, args), state, tolerance, logarithmic, _watch(options))
-        return state.point, state, state.auxiliary
-
-    def terminate(
-        self, fn: Any, y: Array, args: Any, options: Any, state: State, tags: Any
-    ) -> tuple[Array, optx.RESULTS]:
-        """Whether to stop, and why."""
-        running = ~(state.ended | (state.steps >= options.get("most_steps", jnp.inf)))
-        short = optx.RESULTS.where(state.ended, optx.RESULTS.successful, optx.RESULTS.nonlinear_max_steps_reached)
-        result = optx.RESULTS.where(state.failed, optx.RESULTS.nonlinear_divergence, short)
-        return ~running, optx.RESULTS.where(running, optx.RESULTS.successful, result)
-
-    def postprocess(
-        self, fn: Any, y: Array, aux: Any, args: Any, options: Any, state: State, tags: Any, result: Any
-    ) -> tuple[Array, Any, dict[str, Any]]:
-        """The solution, and what is known there."""
-        return y, state.auxiliary, {"state": state}
-
-
-def _watch(options: Any) -> Callable[[Any], Any]:
-    return options.get("watch", lambda auxiliary: None)
-
-
 def _normal_equations(
-    residuals_of: Callable[[Array], tuple[Any, Any]],
-    y: Array,
-    logarithmic: tuple[int, ...],
-    watch: Callable[[Any], Any],
+    residuals_of: Callable[[Array], tuple[Any, Any, Any]], y: Array, logarithmic: tuple[int, ...]
 ) -> tuple[Array, Array, Array, Any, Any]:
-    """Cost, J'r and J'J at y, the auxiliary output, and the Jacobian of what is watched of it; see `step`."""
+    """Cost, J'r and J'J at y, the auxiliary output, and the Jacobian of what is watched; see `step`."""
 
     def push(tangent: Array) -> tuple[Any, Any, Any, Any]:
-        (residuals, auxiliary), (tangents, moved) = jax.jvp(residuals_of, (y,), (tangent,))
-        return residuals, auxiliary, tangents, watch(moved)
+        (residuals, auxiliary, _), (tangents, _, moved) = jax.jvp(residuals_of, (y,), (tangent,))
+        return residuals, auxiliary, tangents, moved
 
     residuals, auxiliary, columns, watched = jax.vmap(push, out_axes=(None, None, 0, 0))(jnp.eye(y.size, dtype=y.dtype))
     cost, gradient, normal = jnp.zeros((), y.dtype), jnp.zeros_like(y), jnp.zeros((y.size, y.size), y.dtype)
@@ -313,9 +264,8 @@ def _initial(model: Any, unit: Array, fresh: Array) -> tuple[State, Array, Array
     it; NaN: its own."""
     vector = model.box.from_unit(unit)
     held = model.objective == "likelihood" and model.varying
-    predicted, rows = jax.eval_shape(model.linearised(model.nothing_known, vector).linear_parts, vector)[1]
-    auxiliary = jnp.zeros(predicted.shape, predicted.dtype), jnp.zeros(rows.shape, rows.dtype)
-    watched = jnp.zeros((unit.size, *rows.shape), rows.dtype)
+    predicted, rows = jax.eval_shape(model.linearised(model.nothing_known).linear_parts, vector)[1]
+    auxiliary, watched = jnp.zeros_like(predicted), jnp.zeros((unit.size, *rows.shape), rows.dtype)
     state = first_state(unit, jnp.where(fresh, FIRST_DAMPING, NEARBY), auxiliary, watched)
     return state, vector, model.initial_sigma(vector) if held else jnp.full((1, 1), jnp.nan)
 
@@ -324,25 +274,22 @@ def _advance(
     model: Any, state: State, known: list[Linearisation], sigma: Array, rough: Array, tolerance: Array
 ) -> tuple[State, Array, Array]:
     """A step by what is known at its trial; and the physical vectors, (P,), of the best point and the next trial."""
-    near, varying = model.linearised(known, model.box.from_unit(state.trial)), _varying(model)
+    near, varying = model.linearised(known), _varying(model)
     first_step = (jnp.where(rough, sigma, jnp.nan), jnp.where(rough, 0.0, 1.0)) if varying else None
-    options = {
-        "watch": lambda auxiliary: auxiliary[1],
-        "tolerance": tolerance if model.objective == "likelihood" else None,
-        "logarithmic": model.logarithmic if varying else (),
-    }
 
-    def residuals(unit: Array, _: None) -> Any:
-        return near.linear_parts(model.box.from_unit(unit), first_step)
+    def residuals(unit: Array) -> Any:
+        found, (predicted, rows) = near.linear_parts(model.box.from_unit(unit), first_step)
+        return found, predicted, rows
 
-    _, state, _ = BoxLevenbergMarquardt().step(residuals, state.point, None, options, state, frozenset())
+    enough = tolerance if model.objective == "likelihood" else None
+    state = step(residuals, state, enough, model.logarithmic if varying else ())
     return state, model.box.from_unit(state.point), model.box.from_unit(state.trial)
 
 
 def _end(state: State, vector: Array, steps: int) -> Descent:
     """What is known where a descent ended, at a physical vector (P,)."""
     finite = bool(np.isfinite(state.cost))
-    predicted, _ = state.auxiliary
+    predicted = np.asarray(state.auxiliary, float)
     return Descent(
         vector=np.asarray(vector, float),
         cost=float(state.cost) if finite else math.inf,
@@ -352,7 +299,7 @@ def _end(state: State, vector: Array, steps: int) -> Descent:
         gradient=np.asarray(state.gradient, float),
         # R of the QR decomposition has A's singular values without squaring its condition number
         root=np.linalg.qr(np.asarray(state.watched, float).T, mode="r"),
-        predicted=np.asarray(predicted, float) if finite else np.full(predicted.shape, math.nan),
+        predicted=predicted if finite else np.full(predicted.shape, math.nan),
     )
 
 

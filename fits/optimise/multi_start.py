@@ -5,8 +5,8 @@ L-BFGS-B of scipy, by jaxopt, shares the objective alone: it checks a minimum on
 """
 
 import warnings
-from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import AbstractContextManager, nullcontext
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -18,13 +18,12 @@ from scipy.stats import qmc
 import layerjax
 from fits.data.geometry import Floats
 from fits.optimise.levenberg_marquardt import COST_TOLERANCE, ROUGH_TOLERANCE, Descent, descent, evaluate_at
-from fits.optimise.uncertainty import Uncertainty, uncertainty
-from fits.problem.compilation import cores, on_all_cores
+from fits.optimise.uncertainty import Uncertainty, scatter, uncertainty
+from fits.problem.compilation import as_finished, on_all_cores
 from fits.problem.model import Model
 from fits.problem.problem import FittingProblem
 from fits.progress import Progress
 from fits.store import Store, fingerprint
-from layerjax._numerics import broadcasting
 
 MOST_STEPS, MOST_ROUNDS = 200, 20  # steps of a start in a round; and rounds, while each gains the next
 LEAST_GAIN, LEAST_RELATIVE_GAIN = 1e-3, 1e-6  # in the log-posterior; for a named objective, as a share of the cost
@@ -48,23 +47,13 @@ def multi_start(
     every = range(len(points))
     stored = {} if store is None else {index: found for index in every if (found := store.get(f"start {index}"))}
     ends = {index: Descent(**found) for index, found in stored.items()}
-
-    def ended(index: int, end: Descent) -> None:
+    left = [index for index in every if index not in ends]
+    for place, end in as_finished(partial(rough_descent, problem), points[left]):
+        index = left[place]
         ends[index] = end
         if store is not None:
             store.put(f"start {index}", end._replace(gradient=None, root=None, predicted=None)._asdict())
         progress("fit", len(ends), len(points), f"best cost {min(end.cost for end in ends.values()):.6g}")
-
-    left = [index for index in every if index not in ends]
-    for index in left[:1]:  # alone: it compiles the program, which keeps one core busy
-        ended(index, rough_descent(problem, points[index]))
-    pool = ThreadPoolExecutor(cores())
-    try:
-        running = {pool.submit(broadcasting(rough_descent), problem, points[index]): index for index in left[1:]}
-        for future in as_completed(running):
-            ended(running[future], future.result())
-    finally:
-        pool.shutdown(cancel_futures=True)
     return [ends[index] for index in every]
 
 
@@ -221,9 +210,8 @@ def polish(
     lowest = lowest._replace(vector=np.where(held, nearest, np.clip(vector, low, high)))
     predicted = evaluate_at(problem, unit_of(problem, lowest.vector)).predicted if held.any() else found.predicted
     # 5. the reduced chi-square where it is above 1; of a named objective, the residual variance
-    freedom, excess = problem.count - len(lowest.vector), 1.0
-    if not likelihood:
-        excess = 2.0 * lowest.cost / max(freedom, 1)
-    elif freedom > 0:
-        excess = max(1.0, float(problem.call(Model.chi_square_at, lowest.vector, predicted)) / freedom)
+    freedom, excess = problem.count - len(lowest.vector), float(scatter(problem, lowest.cost, problem.count))
+    if likelihood and freedom > 0:
+        residuals = np.asarray(problem.call(Model.whitened_residuals_at, lowest.vector, predicted))
+        excess = max(1.0, float(np.sum(residuals**2)) / freedom)
     return Optimum(problem, [*ends[:best], lowest, *ends[best + 1 :]], best, found, improved, predicted, excess)

@@ -25,11 +25,13 @@ OUTCOMES = {
 
 @dataclass(frozen=True, eq=False)
 class Minimum:
-    """A minimum that `count` starts reached: values by name, and half the sum of squared residuals."""
+    """A minimum that `count` starts reached: values by name, half the sum of squared residuals, and whether it is not
+    the best but fits as well."""
 
     values: dict[str, float]
     cost: float
     count: int
+    equivalent: bool = False
 
 
 @dataclass(frozen=True)
@@ -64,10 +66,8 @@ class Fit:
         iterations: steps of the solver to the best minimum.
         condition_number: of the information about the parameters, each scaled to unit length.
         unidentified: the directions in the space of parameters that the data alone do not identify, worst first.
-        minima: the minima that starts reached, best first.
-        alternatives: those among `minima`, other than the best, that fit equally well (local minima of the same model).
-            `errors` and `covariance` are of the best alone; `fits.sample`, `fits.predict` and `fits.evidence` count all
-            that hold a share of the posterior.
+        minima: the minima that starts reached, best first. `errors` and `covariance` are of the best alone;
+            `fits.sample`, `fits.predict` and `fits.evidence` count all that hold a share of the posterior.
         insensitive: names of the parameters that the data say nothing about.
         settings: starts, seed, and the numbers of `FitOptions`.
         start_outcomes: how many starts ended where: "best minimum", "local minima", "maximum steps reached", "failed".
@@ -91,7 +91,6 @@ class Fit:
     condition_number: float
     unidentified: tuple[Direction, ...]
     minima: tuple[Minimum, ...]
-    alternatives: tuple[Minimum, ...]
     insensitive: tuple[str, ...] = ()
     settings: Mapping[str, int | float | str] = field(default_factory=dict)
     start_outcomes: Mapping[str, int] = field(default_factory=dict)
@@ -137,7 +136,6 @@ class Fit:
             insensitive=names(self.insensitive),
             unidentified=tuple(one.renamed(called) for one in self.unidentified if set(one.weights) & set(called)),
             minima=tuple(map(minimum, self.minima)),
-            alternatives=tuple(map(minimum, self.alternatives)),
             without_discrepancy=self.without_discrepancy_parts.get(name),
             dataset=name,
         )
@@ -157,6 +155,11 @@ class Fit:
         if self.dataset is not None:
             words = "without the others it says something else; fit it by itself, or take the whole fit"
             raise ValueError(f"{what}: {self.dataset!r} is a part of a joint fit, and {words}")
+
+    @property
+    def alternatives(self) -> tuple[Minimum, ...]:
+        """Other local minima of the same model that fit equally well."""
+        return tuple(one for one in self.minima if one.equivalent)
 
     @property
     def status(self) -> str:
@@ -216,7 +219,7 @@ class Fit:
     @cached_property
     def chi_square(self) -> float:
         """Sum of squared `residuals`, with correlated noise by its covariance; a named objective's has no scale."""
-        return float(self.problem.call(Model.chi_square_at, self.vector, self.predicted))
+        return float(np.sum(self.residuals**2))
 
     @property
     def degrees_of_freedom(self) -> int:

@@ -8,12 +8,12 @@ the fit worsens by one standard deviation, priors and bounds apart. Along a curv
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from numpy.typing import NDArray
 
-from fits.data.geometry import Floats
+from fits.data.geometry import Floats, Truths
 from fits.optimise.levenberg_marquardt import evaluate_at
 from fits.problem.problem import FittingProblem
 
@@ -68,7 +68,7 @@ class Uncertainty:
     resolve. insensitive: names of those that the data say nothing about. predicted: (N, C), in 1/sr, there.
     """
 
-    at_bound: NDArray[np.bool_]
+    at_bound: Truths
     standard_errors: Floats
     covariance: Floats
     condition_number: float
@@ -89,29 +89,45 @@ def uncertainty(problem: FittingProblem, vector: Floats, cost: float) -> Uncerta
     if not (np.isfinite(found.cost) and np.all(np.isfinite(data_root))):
         nowhere, infinite = np.zeros(count, bool), np.full(count, np.inf)
         return Uncertainty(nowhere, infinite, np.zeros((count, count)), math.inf, (), (), found.predicted)
-    scatter = 1.0  # what a difference in cost is measured in
-    if problem.objective != "likelihood":
-        scatter = max(2.0 * cost / max(problem.count - count, 1), np.finfo(float).tiny)
-    data_root, least_gradient = data_root / np.sqrt(scatter), LEAST_GRADIENT * scatter
-    # what the data say nothing about, whatever is known of the others: its column of A is all but 0
-    idle = np.linalg.norm(data_root, axis=0) * UNKNOWN_BEYOND < 1.0
-    pushes = (unit <= ON_BOUND) & (gradient > least_gradient), (unit >= 1 - ON_BOUND) & (gradient < -least_gradient)
-    at_bound = (pushes[0] | pushes[1]) & ~idle
-    free = np.flatnonzero(~at_bound)
-    width = np.asarray(box.slope(jnp.asarray(vector)), float)
-    unidentified = unidentified_directions(data_root, problem.names, width)
+    unit_cost, width = scatter(problem, cost, problem.count), np.asarray(box.slope(jnp.asarray(vector)), float)
+    root, prior_root = data_root / np.sqrt(unit_cost), np.asarray(box.prior_slopes(), float)
+    least = LEAST_GRADIENT * unit_cost
+    idle, at_bound, deviations, errors = errors_in_boxes(root, prior_root, unit, gradient, least)
+    covariance = deviations.T @ deviations * np.outer(width, width)
+    unidentified = unidentified_directions(root, problem.names, width)
     insensitive = tuple(name for name, none in zip(problem.names, idle, strict=True) if none)
-    data_root, prior_root = data_root[:, free], np.asarray(box.prior_slopes(), float)[:, free]
-    errors, covariance = np.full(count, np.nan), np.zeros((count, count))
-    if free.size:
-        _, values, directions = np.linalg.svd(square(np.vstack([data_root, prior_root])))
-        scaled = directions / floored(values)[:, None]
-        boxes = scaled.T @ scaled  # (A'A)^-1
-        spread = np.sqrt(np.diagonal(boxes))
-        errors[free] = np.where(spread > UNKNOWN_BEYOND, np.inf, spread * width[free])
-        covariance[np.ix_(free, free)] = boxes * np.outer(width[free], width[free])
-    condition = condition_number(data_root)
-    return Uncertainty(at_bound, errors, covariance, condition, unidentified, insensitive, found.predicted)
+    condition = condition_number(root[:, ~at_bound])
+    return Uncertainty(at_bound, errors * width, covariance, condition, unidentified, insensitive, found.predicted)
+
+
+def scatter(problem: FittingProblem, cost: Any, count: Any) -> Any:
+    """What differences in cost count in, of fits to so many data: 1, or the residual variance of a named objective."""
+    if problem.objective == "likelihood":
+        return np.ones_like(cost)
+    return np.maximum(2.0 * cost / np.maximum(count - len(problem.names), 1), np.finfo(np.float32).tiny)
+
+
+def held_by_bounds(unit: Floats, gradient: Floats, least: Any = LEAST_GRADIENT) -> Truths:
+    """Which parameters lie on a bound of the unit box and would go beyond it; least: gradient that counts."""
+    return ((unit <= ON_BOUND) & (gradient > least)) | ((unit >= 1.0 - ON_BOUND) & (gradient < -least))
+
+
+def errors_in_boxes(
+    root: Floats, prior: Floats, unit: Floats, gradient: Floats, least: Any
+) -> tuple[Truths, Truths, Floats, Floats]:
+    """At an optimum, or at each of many: which parameters the data say nothing about, and which a bound holds,
+    (..., P); D, (..., rows, P), whose D'D is the covariance; and standard errors, (..., P), NaN at a bound, infinite
+    where nothing holds a parameter. root, prior: rows A of the data and the prior, (..., rows, P); least: as above.
+    """
+    # whatever is known of the other parameters: the column of A is all but 0
+    insensitive = np.linalg.norm(root, axis=-2) * UNKNOWN_BEYOND < 1.0
+    at_bound = held_by_bounds(unit, gradient, least) & ~insensitive
+    rows = np.where(at_bound[..., None, :], 0.0, np.concatenate([root, prior], axis=-2))
+    _, values, directions = np.linalg.svd(rows, full_matrices=False)
+    deviations = np.where(at_bound[..., None, :], 0.0, directions / floored(values)[..., None])
+    errors = np.linalg.norm(deviations, axis=-2)
+    errors = np.where(errors > UNKNOWN_BEYOND, np.inf, errors)
+    return insensitive, at_bound, deviations, np.where(at_bound, np.nan, errors)
 
 
 def local_information(problem: FittingProblem, unit: Floats) -> tuple[Floats, Floats, float]:
@@ -162,7 +178,8 @@ def unidentified_directions(root: Floats, names: tuple[str, ...], width: Floats)
 
 def floored(values: Floats) -> Floats:
     """Singular values, those lost in rounding as the smallest that are not: their inverses are large, never wrong."""
-    return np.maximum(values, np.maximum(np.finfo(float).eps * len(values) * values[0], 1.0 / LARGEST_ERROR))
+    rounding = np.finfo(values.dtype).eps * values.shape[-1] * values[..., :1]
+    return np.maximum(values, np.maximum(rounding, 1.0 / LARGEST_ERROR))
 
 
 def square(root: Floats) -> Floats:

@@ -137,11 +137,7 @@ def without(problem: Problem, held_out: ArrayLike) -> Problem:
     if model.process is not None:
         floor = model.build(model.box.high).floor  # where it is fitted, it must not matter either
         infinite = INFINITE_ERROR * jnp.hypot(size(model.values, model.softness), floor)
-    model = replace(
-        model,
-        variance=jnp.where(rows, infinite**2, model.variance),
-        lowest=jnp.where(rows, infinite, model.lowest),
-    )
+    model = replace(model, variance=jnp.where(rows, infinite**2, model.variance))
     return problem.with_model(model.with_projection())
 
 

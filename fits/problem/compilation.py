@@ -2,9 +2,10 @@
 
 import os
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager, suppress
 from functools import cache
+from itertools import islice
 from threading import Lock
 from typing import Any, TypeVar
 
@@ -129,6 +130,28 @@ def _threads() -> ThreadPoolExecutor:
 def on_all_cores(call: Callable[[T], U], items: Iterable[T]) -> list[U]:
     """What `call` gives of each, whose programs are compiled."""
     return list(_threads().map(broadcasting(call), items))
+
+
+def as_finished(call: Callable[[T], U], items: Iterable[T], threads: int | None = None) -> Iterator[tuple[int, U]]:
+    """The place of each item and what `call` gives of it, as they finish, by so many threads, or one a core.
+
+    The first runs by itself: it compiles the program, which keeps one core busy. With one thread the calling one works.
+    """
+    pending, most = iter(enumerate(items)), threads or cores()
+    for index, item in islice(pending, None if most == 1 else 1):
+        yield index, call(item)
+    running: dict[Future[U], int] = {}
+    pool = ThreadPoolExecutor(most)
+    try:  # each is begun when there is room for it: an interrupt need not wait for the others
+        while True:
+            for index, item in islice(pending, most - len(running)):
+                running[pool.submit(broadcasting(call), item)] = index
+            if not running:
+                return
+            for future in wait(running, return_when=FIRST_COMPLETED).done:
+                yield running.pop(future), future.result()
+    finally:
+        pool.shutdown(cancel_futures=True)  # waits for what has begun
 
 
 def in_shares(

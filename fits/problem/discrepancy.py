@@ -391,7 +391,8 @@ def _(primals: tuple[Any, ...], tangents: tuple[Any, ...], *, process: Process) 
         jnp.zeros_like(one) if tangent is None else tangent for one, tangent in zip(primals, tangents, strict=True)
     )
     found = process.regress(misfit, relative, numbers)
-    inverse, own, fitted = _triangular_inverse(found.root), found.projection, process.errors(found.estimate, relative)
+    own, fitted = found.projection, process.errors(found.estimate, relative)
+    inverse = solve_triangular(found.root, jnp.eye(len(found.root), dtype=found.root.dtype), lower=True)
     unfitted, white = relative * misfit - fitted, inverse @ found.estimate.reshape(-1)
 
     # by what is predicted
@@ -439,10 +440,6 @@ def _each_channel(matrices: Array, columns: Array) -> Array:
 def _root(matrix: Array) -> Array:
     """Cholesky factor of a symmetric matrix: XLA would compute its elements twice to symmetrise it."""
     return cholesky(matrix, symmetrize_input=False)
-
-
-def _triangular_inverse(root: Array) -> Array:
-    return solve_triangular(root, jnp.eye(len(root), dtype=root.dtype), lower=True)
 
 
 def _with_jitter(matrix: Any, least: float = JITTER) -> Any:

@@ -7,7 +7,7 @@ that of several.
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
 from itertools import pairwise
 from typing import Any, Literal, NamedTuple, cast
 
@@ -65,10 +65,15 @@ class Parts(NamedTuple):
 
 
 class Linearisation(NamedTuple):
-    """What a model predicts at a vector, (N, C), in 1/sr, and its slopes by the first parameters, (M, N, C)."""
+    """What a model predicts, (N, C), in 1/sr, with slopes by the first parameters, (M, N, C), at these values, (M,)."""
 
     values: Any
     slopes: Any
+    at: Any
+
+    def predict(self, model: "Model", vector: Array) -> Array:
+        """Scaled BSDF, (N, C), in 1/sr, of the model near there."""
+        return self.values + jnp.tensordot(vector[: len(self.at)] - self.at, self.slopes, 1)
 
 
 class Model(eqx.Module):
@@ -77,11 +82,12 @@ class Model(eqx.Module):
     What ends with `_at` takes what the vector predicts, (N, C), beside it, so that nothing is computed twice.
 
     template: of `Parts`. box: bounds and priors of the P parameters. wi, wo: directions of the N samples, (N, 3).
-    values: BSDF, (N, C), in 1/sr. variance: the measurement's own, (N, C), in 1/sr^2. lowest: what sigma cannot fall
-    below, (N, C), in 1/sr. known: what is known of the directions beforehand. optics: how an instrument sees them, None
+    values: BSDF, (N, C), in 1/sr. variance: the measurement's own, (N, C), in 1/sr^2. least_floor: of the
+    noise, in 1/sr. known: what is known of the directions beforehand. optics: how an instrument sees them, None
     for exact directions. process: the model discrepancy, with the softness of its `logarithm`, (N, C), in 1/sr; None
     without. side: "reflection" if all directions lie above. varying: whether sigma depends on the parameters. moving:
-    so many of them come first, on which predictions depend; the others are those of the noise.
+    so many of them come first, on which predictions depend; the others are those of the noise. stand_in: whose
+    `predict(model, vector)` takes the place of what the transport says, if any: a `Linearisation` or an emulator.
     """
 
     template: Template
@@ -90,7 +96,7 @@ class Model(eqx.Module):
     wo: Array
     values: Array
     variance: Array
-    lowest: Array
+    least_floor: Array
     degrees_of_freedom: Array
     transport: Transport
     known: KnownDirections | None
@@ -102,6 +108,12 @@ class Model(eqx.Module):
     tails: Tails = eqx.field(static=True)
     varying: bool = eqx.field(static=True)
     moving: int = eqx.field(static=True)
+    stand_in: Any = None
+
+    @property
+    def lowest(self) -> Array:
+        """What sigma cannot fall below, (N, C), in 1/sr."""
+        return jnp.hypot(jnp.sqrt(self.variance), self.least_floor)
 
     def residuals(self, vector: Array) -> tuple[Array, ...]:
         """`residuals_at` what these parameters predict."""
@@ -110,10 +122,6 @@ class Model(eqx.Module):
     def cost_at(self, vector: Array, predicted: Array) -> Array:
         """Half the sum of squared residuals."""
         return 0.5 * jnp.sum(jnp.stack([jnp.sum(part**2) for part in self.residuals_at(vector, predicted)]))
-
-    def log_likelihood_per_datum(self, vector: Array) -> Array:
-        """`log_likelihood_per_datum_at` what these parameters predict."""
-        return self.log_likelihood_per_datum_at(vector, self.predict(vector))
 
     def log_likelihood(self, vector: Array) -> Array:
         """Normalised log-likelihood of all data."""
@@ -142,19 +150,15 @@ class Model(eqx.Module):
         projection = project(weights, size(values, softness) / total_sigma(values, variance, relative, floor))
         return replace(self, process=replace(self.process, projection=jax.tree.map(jnp.asarray, projection)))
 
-    def linearised(self, known: Sequence[Linearisation], at: Array) -> "Model":
-        """The model near a vector (P,) that its one data set was linearised at."""
-        return linear(self, known[0], at)
+    def linearised(self, known: Sequence[Linearisation]) -> "Model":
+        """The model near the vector (P,) that its one data set was linearised at."""
+        return replace(self, stand_in=known[0])
 
     @property
     def nothing_known(self) -> list[Linearisation]:
         """In the shape of what `linearised` asks for, of the one data set."""
-        return [Linearisation(jnp.zeros_like(self.values), jnp.zeros((self.moving, *self.values.shape)))]
-
-    @property
-    def places(self) -> tuple[tuple[int, ...], ...]:
-        """Of the parameters of the one data set: all of them."""
-        return (tuple(range(len(self.box.low))),)
+        slopes = jnp.zeros((self.moving, *self.values.shape), self.values.dtype)
+        return [Linearisation(jnp.zeros_like(self.values), slopes, self.box.low[: self.moving])]
 
     def build(self, vector: Array) -> Parts:
         """Stack, scale and noise levels with these parameters."""
@@ -162,6 +166,8 @@ class Model(eqx.Module):
 
     def predict(self, vector: Array) -> Array:
         """Scaled BSDF, (N, C), in 1/sr: a stack of one channel has the same in all."""
+        if self.stand_in is not None:
+            return self.stand_in.predict(self, vector)
         parts = self.build(vector)
 
         def values(wi: Array, wo: Array, known: KnownDirections | None) -> Array:
@@ -201,13 +207,6 @@ class Model(eqx.Module):
         if self.process is None:
             return self.standardised_at(vector, predicted)
         return -self.process.whitened_residuals(*self._of_process(vector, predicted))
-
-    def chi_square_at(self, vector: Array, predicted: Array) -> Array:
-        """z'S^-1 z of `standardised_at` z, with S their covariance: 1 without model discrepancy."""
-        if self.process is None:
-            return jnp.sum(self.standardised_at(vector, predicted) ** 2)
-        found = self.whitened_at(vector, predicted)
-        return jnp.sum(found.unfitted**2) + jnp.sum(found.estimates**2)
 
     def whitened_at(self, vector: Array, predicted: Array, step: Step = None) -> Whitened:
         """Independent residuals of the measurements and of the errors at inducing points."""
@@ -279,12 +278,8 @@ class Model(eqx.Module):
         """Misfit of the logarithm, an error of 1 in it in units of the noise, and the numbers of the process."""
         misfit = logarithm(predicted, self.softness) - logarithm(self.values, self.softness)
         relative = size(self.values, self.softness) / self._noise_at(vector, predicted, step)
-        return misfit, relative, self._correlation(vector, step)
-
-    def _correlation(self, vector: Array, step: Step = None) -> Correlation:
-        at = self.build(vector).correlation
-        assert at is not None
-        return at if step is None else at._replace(amplitude=step[1] * at.amplitude)
+        at = cast(Correlation, self.build(vector).correlation)
+        return misfit, relative, at if step is None else at._replace(amplitude=step[1] * at.amplitude)
 
     def residuals_at(
         self, vector: Array, predicted: Array, step: Step = None, whitened: Whitened | None = None
@@ -317,23 +312,14 @@ class Model(eqx.Module):
 def linearise(model: Model, vector: Array) -> Linearisation:
     """Values and slopes at a vector (P,), by the parameters that predictions depend on."""
     steps = jnp.eye(vector.size, dtype=vector.dtype)[: model.moving]
-    return Linearisation(*jax.vmap(lambda step: jax.jvp(model.predict, (vector,), (step,)), out_axes=(None, 0))(steps))
+    along = jax.vmap(lambda step: jax.jvp(model.predict, (vector,), (step,)), out_axes=(None, 0))
+    values, slopes = along(steps)
+    return Linearisation(values, slopes, vector[: model.moving])
 
 
-class Linear(Model):
-    """A model near a vector `at` (P,), by what is known there."""
-
-    near: Linearisation
-    at: Array
-
-    def predict(self, vector: Array) -> Array:
-        """Scaled BSDF, (N, C), in 1/sr."""
-        return self.near.values + jnp.tensordot((vector - self.at)[: len(self.near.slopes)], self.near.slopes, 1)
-
-
-def linear(model: Model, near: Linearisation, at: Array) -> Linear:
-    """The model near a vector (P,) that it was linearised at."""
-    return Linear(**{one.name: getattr(model, one.name) for one in fields(Model)}, near=near, at=at)
+def predict_each(model: Model, vectors: Array) -> Array:
+    """What each of the vectors (D, P) predicts, (D, N, C), in 1/sr."""
+    return jax.lax.map(model.predict, vectors)
 
 
 class JointModel(eqx.Module):
@@ -349,13 +335,11 @@ class JointModel(eqx.Module):
     objective: Objective = eqx.field(static=True, default="likelihood")  # which weighs data sets by their noise
 
     residuals, cost_at, log_prior = Model.residuals, Model.cost_at, Model.log_prior
-    log_likelihood, log_likelihood_per_datum = Model.log_likelihood, Model.log_likelihood_per_datum
-    log_posterior_unconstrained = Model.log_posterior_unconstrained
+    log_likelihood, log_posterior_unconstrained = Model.log_likelihood, Model.log_posterior_unconstrained
 
-    def linearised(self, known: Sequence[Linearisation], at: Array) -> "JointModel":
-        """The model near a vector (P,) that its data sets were linearised at."""
-        parts = zip(self._with_vectors(at), known, strict=True)
-        return replace(self, parts=tuple(linear(part, there, own) for (part, own), there in parts))
+    def linearised(self, known: Sequence[Linearisation]) -> "JointModel":
+        """The model near the vector (P,) that its data sets were linearised at."""
+        return replace(self, parts=tuple(part.linearised([one]) for part, one in zip(self.parts, known, strict=True)))
 
     @property
     def nothing_known(self) -> list[Linearisation]:
@@ -382,9 +366,6 @@ class JointModel(eqx.Module):
 
     def log_likelihood_per_datum_at(self, vector: Array, predicted: Array) -> Array:
         return _column(self._each(Model.log_likelihood_per_datum_at, vector, predicted))
-
-    def chi_square_at(self, vector: Array, predicted: Array) -> Array:
-        return jnp.sum(jnp.stack(self._each(Model.chi_square_at, vector, predicted)))
 
     def log_likelihood_at(self, vector: Array, predicted: Array) -> Array:
         return jnp.sum(jnp.stack(self._each(Model.log_likelihood_at, vector, predicted)))

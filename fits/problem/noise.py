@@ -136,10 +136,9 @@ class Levels(NamedTuple):
     floor: float | Free
 
     @property
-    def smallest(self) -> Floats:
-        """What sigma cannot fall below, (N, C) or (1,), in 1/sr."""
-        floor = self.floor.low if isinstance(self.floor, Free) else self.floor
-        return np.sqrt(self.variance + np.square(floor))
+    def least_floor(self) -> float:
+        """What the floor cannot fall below, in 1/sr."""
+        return float(self.floor.arrays()[1]) if isinstance(self.floor, Free) else self.floor
 
     @property
     def fitted(self) -> bool:
@@ -162,15 +161,15 @@ def is_assumed(noise: Noise, used: Measurements) -> bool:
     return noise.relative is None and noise.floor is None and (used.sigma is None or not noise.use_sigma)
 
 
-def noise_levels(noise: Noise, used: Measurements) -> Levels:
-    """The levels of noise, with the defaults that `Noise` states."""
+def noise_levels(noise: Noise, used: Measurements, values: Floats | None = None) -> Levels:
+    """The levels of noise, with the defaults that `Noise` states; values: whose median the floor follows, if others."""
     sigma = used.sigma if noise.use_sigma else None
     relative, floor = noise.relative, noise.floor
     if relative is None:
         relative = DEFAULT_RELATIVE if is_assumed(noise, used) else 0.0
     if floor is None:
         alone = not is_free(relative) and relative == 0
-        floor = 0.0 if alone else DEFAULT_FLOOR * float(np.median(np.abs(used.values)))
+        floor = 0.0 if alone else DEFAULT_FLOOR * float(np.median(np.abs(used.values if values is None else values)))
     return Levels(np.zeros(1) if sigma is None else np.square(sigma), relative, floor)
 
 

@@ -31,7 +31,7 @@ from fits.problem.compilation import Static, run
 from fits.problem.discrepancy import Discrepancy, Process, make_process, numbers_of
 from fits.problem.hemispherical import Totalling
 from fits.problem.instrument import Instrument, optics_of, setting_of
-from fits.problem.model import JointModel, Linearisation, Model, Transport, linearise
+from fits.problem.model import JointModel, Linearisation, Model, Parts, Transport, linearise, predict_each
 from fits.problem.noise import Levels, Noise, is_assumed, noise_levels, require_size
 from fits.problem.parameters import Box, Free, LogNormal, Normal, is_free, names_of, require_in_range, split
 from layerjax._checks import in_short, require_choice, require_kind, require_number
@@ -57,10 +57,12 @@ PLACES = ("", "scale", "instrument", "noise.relative", "noise.floor", "noise.dis
 
 
 class Assembled(NamedTuple):
-    """What follows from a problem as it was given: its parameters by name, and their density."""
+    """What follows from a problem as it was given: its parameters by name, their density, and for each data set the
+    places of its own in the vector."""
 
     free: dict[str, Free]
     model: Any
+    places: tuple[tuple[int, ...], ...]
 
 
 class FittingProblem(abc.ABC):
@@ -126,7 +128,7 @@ class FittingProblem(abc.ABC):
         """Where the parameters of one data set stand in the vector."""
         if name not in self.problems:
             raise ValueError(f"part {name!r} is not one of {', '.join(self.problems)}")
-        return dict(zip(self.problems, self.model.places, strict=True))[name]
+        return dict(zip(self.problems, self._assembled.places, strict=True))[name]
 
     def shares(self, predicted: Floats) -> dict[str, Floats]:
         """What `predict` gives of each data set, in the shape of its data."""
@@ -148,10 +150,6 @@ class FittingProblem(abc.ABC):
     def log_likelihood(self, vector: ArrayLike) -> Array:
         """Normalised log-likelihood of the used samples with the physical vector (P,)."""
         return self.call(Model.log_likelihood, vector)
-
-    def log_likelihood_per_datum(self, vector: ArrayLike) -> Array:
-        """Normalised log-density of each datum with the physical vector (P,), (N, C)."""
-        return self.call(Model.log_likelihood_per_datum, vector)
 
     def log_prior(self, vector: ArrayLike) -> Array:
         """Log-density of the physical vector, -inf outside the bounds."""
@@ -264,7 +262,7 @@ class Problem(FittingProblem):
         """Scaled BSDF along other directions, (M, 3) each, with D vectors (D, P): (D, M, C), in 1/sr."""
         wi, wo = np.asarray(wi, float), np.asarray(wo, float)
         other = self.with_model(replace(self.model, **_directions(self, wi, wo)))
-        return other.call(_predict_each, vectors)
+        return other.call(predict_each, vectors)
 
     def with_other_rays(self) -> "Problem":
         """The problem with other numbers of rays for the cones of its instrument: what differs is their error."""
@@ -278,13 +276,6 @@ class Problem(FittingProblem):
         if "without_discrepancy" in vars(self) and self.noise.discrepancy and model.wi is self.model.wi:
             vars(other)["without_discrepancy"] = self.without_discrepancy
         return other
-
-
-class JointParts(NamedTuple):
-    """Stacks and calibration factors of data sets, by their names."""
-
-    stack: dict[str, Any]
-    scale: dict[str, Any]
 
 
 class Joint(FittingProblem):
@@ -329,7 +320,8 @@ class Joint(FittingProblem):
         places = tuple(tuple(place[name] for name in names_of(some)) for some in own.values())
         models = tuple(problem.model for problem in self.parts.values())
         varying = any(one.varying for one in models)
-        return Assembled(free, JointModel(parts=models, box=Box.of(free.values()), places=places, varying=varying))
+        model = JointModel(parts=models, box=Box.of(free.values()), places=places, varying=varying)
+        return Assembled(free, model, places)
 
     def _common(self) -> dict[str, Free]:
         """What is shared, as the first data set has it. ValueError where it is not in every one, or differs."""
@@ -351,11 +343,12 @@ class Joint(FittingProblem):
                 raise ValueError(f"Joint.shared: {words}")
         return common
 
-    def build(self, vector: ArrayLike) -> JointParts:
-        """Stacks and scales with the physical vector (P,)."""
+    def build(self, vector: ArrayLike) -> Parts:
+        """Stacks, scales and noise levels with the physical vector (P,), each by the names of the data sets."""
         vector = np.asarray(vector)
         built = {name: problem.build(vector[list(self.places(name))]) for name, problem in self.parts.items()}
-        return JointParts(*({name: one[k] for name, one in built.items()} for k in range(2)))
+        parts: Any = (dict(zip(built, one, strict=True)) for one in zip(*built.values(), strict=True))
+        return Parts(*parts)
 
     @property
     def problems(self) -> dict[str, Problem]:
@@ -405,7 +398,7 @@ def _assemble(problem: Problem) -> Assembled:
         box=Box.of(free.values()),
         values=jnp.asarray(used.values),
         variance=jnp.asarray(np.broadcast_to(levels.variance, used.values.shape)),
-        lowest=jnp.asarray(np.broadcast_to(levels.smallest, used.values.shape)),
+        least_floor=jnp.asarray(levels.least_floor),
         degrees_of_freedom=jnp.asarray(float(noise.degrees_of_freedom)),
         transport=Totalling.of(used, problem.transport) if isinstance(used, Totals) else problem.transport,
         process=process,
@@ -427,7 +420,7 @@ def _assemble(problem: Problem) -> Assembled:
         raise ValueError(f"stack: it has {shape[-1]} channels, the data {used.values.shape[-1]}: {used.channels}")
     if np.broadcast_shapes(shape, used.values.shape) != used.values.shape:
         raise ValueError(f"transport: it gives values of shape {shape}, the data have {used.values.shape}")
-    return Assembled(free, model)
+    return Assembled(free, model, (tuple(range(len(names))),))
 
 
 def _require_kinds(problem: Problem) -> None:
@@ -451,7 +444,7 @@ def _require_kinds(problem: Problem) -> None:
 def _require_weights(objective: Objective, levels: Levels, process: Process | None, free: Mapping[str, Free]) -> None:
     """A likelihood needs noise; beside a named residual nothing may stand that only a likelihood weighs."""
     if objective == "likelihood":
-        if not np.all(levels.smallest > 0):
+        if not np.all(levels.variance + np.square(levels.least_floor) > 0):
             raise ValueError("noise: sigma could become 0; give a floor above 0, or data with sigma")
         return
     weighed = [f"noise.{name}" for name in ("relative", "floor") if is_free(getattr(levels, name))]
@@ -517,7 +510,3 @@ def unit(name: str) -> str:
     """The unit of a parameter of this name; "1" for plain ratios."""
     whole = re.sub(r"\[\d+\]$|\.amplitude$", "", name)  # of a channel, or of a power law's reference
     return next((one for end, one in UNITS.items() if whole.endswith(end)), "1")
-
-
-def _predict_each(model: Model, vectors: Array) -> Array:
-    return jax.lax.map(model.predict, vectors)

@@ -14,7 +14,7 @@ from scipy.interpolate import RegularGridInterpolator
 import layerjax as lj
 from fits.data.geometry import Floats
 from fits.reports.plots.data import CYCLE, STYLE
-from layerjax._checks import in_short
+from layerjax._checks import require_count
 from layerjax.mixture import require_material, stacks_of
 
 Prepared = lj.Prepared | lj.Mixture
@@ -53,8 +53,7 @@ def render(
         ValueError: a size out of range, a stack that ends in another index than air, or a transport that is random.
     """
     require_material(stack)
-    if not (isinstance(size, int) and 16 <= size <= 1024):  # more take several GB, and the picture has no more across
-        raise ValueError(f"size is {in_short(size)}, must be in [16, 1024] pixels")
+    require_count("size", size, 16, 1024)  # more take several GB, and the picture has no more across
     for part in stacks_of(stack):
         indices = [float(layer.ior) for layer in part.layers if isinstance(layer, lj.Interface)]
         if part.base is None and indices and indices[-1] != 1.0:

@@ -33,10 +33,10 @@ from fits.sampling.sample import NoSteps, load
 from layerjax import Transport
 from layerjax._checks import require_kind
 
-SCHEMA = 6
+SCHEMA = 7
 FIT, HELD_OUT, REPORT, SUMMARY, LOCK = "fit.json", "held_out.csv", "report.html", "summary.json", "chain.db.lock"
 DATA, PROBLEM, FITTED, CHAIN = "data.csv", "problem.toml", "fitted.toml", "chain.db"
-_FIELDS = [one.name for one in fields(Fit) if one.name not in ("problem", "alternatives", "without_discrepancy_parts")]
+_FIELDS = [one.name for one in fields(Fit) if one.name not in ("problem", "without_discrepancy_parts")]
 
 
 # ---- fits ----
@@ -87,7 +87,6 @@ def write_fit(fit: Fit, folder: Path, text: str | None = None) -> None:
         "spheres": None if spheres is None else asdict(spheres),
         **{name: getattr(fit, name) for name in numbers},
         "fit": {name: plain[name] for name in _FIELDS},
-        "alternatives": [k for k, one in enumerate(fit.minima) if any(one is same for same in fit.alternatives)],
         "checksums": {name: files.text_checksum(folder / name) for name in (DATA, PROBLEM)},
     }
     files.write_json(folder / FIT, content)
@@ -129,8 +128,7 @@ def load_fit(directory: str | Path) -> Fit:
         if stored["without_discrepancy"] is not None:
             stored["without_discrepancy"] = WithoutDiscrepancy(**stored["without_discrepancy"])
         stored["minima"] = tuple(Minimum(**one) for one in stored["minima"])
-        alternatives = tuple(stored["minima"][index] for index in content["alternatives"])
-        return Fit(problem=problem, alternatives=alternatives, **stored)
+        return Fit(problem=problem, **stored)
     except (LookupError, TypeError, AttributeError) as error:
         raise ValueError(f"{directory / FIT}: damaged, it is not what `save_fit` writes") from error
 

@@ -127,7 +127,7 @@ def parameter_table(fit: Fit, both: bool = False) -> Table:
 def minima_table(fit: Fit) -> Table:
     """The minima that the starts reached, a column each, best first: how many starts, the cost, the values there."""
     minima = fit.minima[:MOST_MINIMA]
-    heads = ["same cost" if any(one is other for other in fit.alternatives) else "higher cost" for one in minima[1:]]
+    heads = ["same cost" if one.equivalent else "higher cost" for one in minima[1:]]
     rows = [
         ("starts", *(str(one.count) for one in minima)),
         ("cost", *(f"{one.cost:.6g}" for one in minima)),

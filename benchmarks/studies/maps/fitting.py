@@ -18,9 +18,10 @@ from benchmarks.studies.maps.work import Texelwise, Timed, costs_at, rows_of, ti
 from fits.engines import Failure
 from fits.engines import run as run_tasks
 from fits.maps.inputs import Block
-from fits.maps.pilot import Job, predict_all
+from fits.maps.pilot import Job
 from fits.maps.search import sigmas
 from fits.maps.store import FittedMap
+from fits.problem.model import predict_each
 
 Floats = NDArray[np.float64]
 Report = Callable[[str], None]
@@ -264,8 +265,8 @@ def emulator_error(job: Job, fit: FittedMap, checked: int) -> float | None:
         return None
     at = np.linspace(0, fit.flags.size - 1, checked).astype(int)
     vectors = np.stack([fit.values[name].ravel()[at] for name in fit.names], axis=1)
-    mine = predict_all(problem, vectors)
-    fine = predict_all(replace(problem, transport=transport.finer()), vectors)
+    mine = np.asarray(problem.call(predict_each, vectors))
+    fine = np.asarray(replace(problem, transport=transport.finer()).call(predict_each, vectors))
     sigma = sigmas(problem, vectors, fine)
     return float(np.max(np.abs(mine - fine) / sigma))
 

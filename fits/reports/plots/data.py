@@ -133,14 +133,9 @@ def totals_picture(totals: Totals, fit: Fit | None = None) -> Figure:
 # ---- fits and predictions ----
 
 
-def bsdf(fit: Fit) -> np.ndarray:
-    """Predicted BSDF at every row, with the model discrepancy, (N, C), in 1/sr; NaN in unused rows."""
-    used = fit.problem.data.used()
-    return over_all_rows(fit, with_discrepancy(fit, used.wi, used.wo, fit.predicted))
-
-
 def misfit(fit: Fit) -> np.ndarray:
-    """Measurements less `bsdf`, which follows the data, in units of the noise, (N, C); NaN in unused rows."""
+    """Measurements less the model with its discrepancy, which follows them, in units of the noise, (N, C); NaN in
+    unused rows."""
     independent = np.asarray(fit.problem.call(Model.offsets_after_discrepancy_at, fit.vector, fit.predicted), float)
     return over_all_rows(fit, independent / residual_unit(fit))
 
@@ -282,7 +277,8 @@ def maps_picture(fit: Fit) -> Figure | None:
     if not (shown := mapped(data)):
         return None
     values = np.where(data.mask, data.values[:, 0], np.nan)
-    predicted, residuals = bsdf(fit)[:, 0], misfit(fit)[:, 0]
+    used, residuals = data.used(), misfit(fit)[:, 0]
+    predicted = over_all_rows(fit, with_discrepancy(fit, used.wi, used.wo, fit.predicted))[:, 0]
     norm = value_norm(values[data.mask])
     limit = float(np.clip(np.nanquantile(np.abs(residuals), 0.98), 3.0, 30.0))
     model = "with discrepancy" if fit.problem.noise.discrepancy else "model"

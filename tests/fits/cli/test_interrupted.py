@@ -16,6 +16,7 @@ from fits.reports.plots.data import data_picture
 from fits.store import Store
 from tests.helpers.coats import make_folder
 from tests.helpers.files import contents, largest_file, read_only
+from tests.helpers.stores import keys
 from tests.helpers.tasks import started, wait_until
 
 FIT = ["fit", "data.csv", "--stack", "coat.toml", "--out", "result"]
@@ -110,9 +111,9 @@ def test_a_fit_on_a_full_disk_keeps_its_starts_and_the_earlier_result(work, caps
         assert refusal(words, capsys) == "layerjax: error: result/report.html: file too large"
     after = contents(work)
     after.pop(str(work / ".result.starts"))
-    assert len(Store.read(".result.starts").keys()) == 3
+    assert len(keys(Store.read(".result.starts"))) == 3
     assert after == before
-    monkeypatch.setattr(starts, "rough_descent", None)  # no start is run again
+    monkeypatch.setattr(starts, "rough_descent", pytest.fail)  # no start is run again
     monkeypatch.setattr(FitReport, "write", lambda *_: None)
     assert main(words) == 0
     assert not list(work.glob(".*"))
@@ -123,7 +124,7 @@ def test_an_interrupted_fit_exits_with_130_and_the_next_resumes_with_the_starts_
 ):
     done = work / ".result.starts"
     with started(["-m", "fits.cli", *MANY_STARTS]) as process:
-        wait_until(lambda: process.poll() is not None or (done.is_file() and len(Store.read(done).keys()) > 2))
+        wait_until(lambda: process.poll() is not None or (done.is_file() and len(keys(Store.read(done))) > 2))
         assert process.poll() is None, "it ended too soon"
         process.send_signal(signal.SIGSTOP)
         before = contents(work)
@@ -140,7 +141,7 @@ def test_an_interrupted_fit_exits_with_130_and_the_next_resumes_with_the_starts_
     words = "result was not written; the same command resumes with the starts that are done"
     assert error.splitlines()[-1] == f"layerjax: interrupted: {words}"
     assert not (work / "result").exists()
-    kept = len(Store.read(done).keys())
+    kept = len(keys(Store.read(done)))
     assert 2 < kept < 200
     solve, solved = starts.rough_descent, []
     monkeypatch.setattr(starts, "rough_descent", lambda *given, **how: solved.append(how) or solve(*given, **how))

@@ -5,6 +5,7 @@ import pytest
 
 from fits.data.geometry import azimuth, direction, polar, slices
 from fits.data.measurements import Measurements, channel_names
+from fits.data.reading import ReadOptions
 
 
 def measurements(theta_i=(30.0, 30.0, 60.0), theta_o=(30.0, 0.0, 45.0), **changes):
@@ -57,8 +58,8 @@ def test_bad_arrays_are_refused(change, message):
 def test_masks_narrow_and_are_noted():
     data = measurements(theta_i=(30.0, 30.0, 80.0), theta_o=(30.0, -33.0, 45.0))
     for degrees, near in ((2.9, True), (3.1, False), (8, False)):
-        np.testing.assert_array_equal(data.without_retro(degrees).mask, [True, near, True])
-    both = data.without_retro(8).without_grazing(75)
+        np.testing.assert_array_equal(ReadOptions(min_retro_angle=degrees).masked(data).mask, [True, near, True])
+    both = ReadOptions(min_retro_angle=8, max_polar_angle=75).masked(data)
     np.testing.assert_array_equal(both.mask, [True, False, False])
     assert both.used().values.ravel().tolist() == [1]
     assert both.source.notes == (
@@ -70,7 +71,7 @@ def test_masks_narrow_and_are_noted():
     with pytest.raises(ValueError, match="read-only"):
         zero.values[0] = 2
     through = measurements(theta_i=(30.0, 30.0), theta_o=(100.0, 170.0))  # counted from the side where it leaves
-    np.testing.assert_array_equal(through.without_grazing(75).mask, [False, True])
+    np.testing.assert_array_equal(ReadOptions(max_polar_angle=75).masked(through).mask, [False, True])
     with pytest.raises(ValueError, match="keep has shape"):
         data.where(np.ones(2, bool))
 

@@ -1,5 +1,7 @@
 """Emulators in the place of a transport: their values and derivatives against the transport itself, a toy of one."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,7 +10,7 @@ from scipy.stats import qmc
 
 import fits
 import layerjax as lj
-from fits.maps.emulator import emulate, with_emulator
+from fits.maps.emulator import emulate
 from fits.problem.model import Model
 from tests.helpers.models import along
 
@@ -42,7 +44,7 @@ def emulated(problem):
     emulator, words = emulate(problem)
     assert emulator is not None
     assert "an emulator of" in words
-    return problem.with_model(with_emulator(problem.model, emulator))
+    return problem.with_model(replace(problem.model, stand_in=emulator))
 
 
 @pytest.fixture(scope="module")

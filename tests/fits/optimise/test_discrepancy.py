@@ -91,7 +91,7 @@ def test_a_killed_fit_goes_on_in_either_part(tmp_path, wrong, monkeypatch):
     kept = tmp_path / "starts"
 
     def stop(stage, done, total=None, info=""):
-        if stage.endswith("model discrepancy") and done == 2:
+        if stage.startswith("with model discrepancy") and done == 2:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
@@ -106,7 +106,7 @@ def test_a_killed_fit_goes_on_in_either_part(tmp_path, wrong, monkeypatch):
 
 def test_a_result_directory_keeps_it(tmp_path, coat_fit):
     problem = replace(coat_fit.problem, noise=Noise(relative=0.03, discrepancy=True))
-    count, nothing = len(problem.names), {"minima": (), "alternatives": (), "unidentified": ()}
+    count, nothing = len(problem.names), {"minima": (), "unidentified": ()}
     numbers = {"vector": np.array(problem.start), "errors": np.ones(count), "covariance": np.eye(count)}
     before = WithoutDiscrepancy(coat_fit.values, coat_fit.standard_errors, 30.0, 20, 12.5, 0.4, 19)
     found = replace(coat_fit, problem=problem, **numbers, **nothing, without_discrepancy=before)

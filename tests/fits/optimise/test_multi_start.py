@@ -13,6 +13,7 @@ from fits.optimise.multi_start import LEAST_GAIN, multi_start, start_points, sta
 from fits.optimise.result import OUTCOMES
 from tests.helpers.models import LINE, LOBE, LOBE_STACK, directions, line, line_data, lobe, measured, noisy_lobe
 from tests.helpers.places import COATINGS, EXAMPLES
+from tests.helpers.stores import keys
 
 STEEL = COATINGS / "nite_on_blasted_steel1008_650nm_inplane.csv"
 
@@ -84,7 +85,7 @@ def test_starts_are_those_of_the_same_fit_only(tmp_path):
         path.write_bytes(written)
         problem = Problem(**{"stack": LINE, "data": line_data(), "transport": line} | changed)
         with starts_store(path, problem, start_points(problem, count, seed)) as store:
-            return len(store.keys())
+            return len(keys(store))
 
     fit(LINE, line_data(), transport=line, starts=4, checkpoint=path)
     written = path.read_bytes()

@@ -91,7 +91,7 @@ def test_a_fit_resumes_with_the_starts_that_are_done_and_is_kept_with_its_resolu
     refined, sharp, monkeypatch, tmp_path
 ):
     found, kept = refined
-    monkeypatch.setattr(starts_module, "rough_descent", None)  # no start is run again
+    monkeypatch.setattr(starts_module, "rough_descent", pytest.fail)  # no start is run again
     again = fit(STACK, sharp, starts=2, checkpoint=kept)
     results.save_fit(found, tmp_path / "fit")
     for other in (again, results.load_fit(tmp_path / "fit")):

@@ -121,7 +121,7 @@ def test_likelihoods_of_all_and_of_each_given_the_others_are_those_of_the_dense_
     precision = np.linalg.inv(covariance)
     width = 1.0 / np.sqrt(np.diagonal(precision))
     expected = stats.norm.logpdf(precision @ (where - mean) * width) - np.log(width) + slopes
-    found = of.log_likelihood_per_datum(of.start)
+    found = of.call(Model.log_likelihood_per_datum_at, of.start, of.predict(of.start))
     np.testing.assert_allclose(np.ravel(found), expected, atol=1e-4)
 
 

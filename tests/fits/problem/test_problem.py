@@ -12,6 +12,7 @@ from scipy import integrate, stats
 
 import layerjax as lj
 from fits import Free, LogNormal, LogUniform, Noise, Normal, Problem, simulate, slices
+from fits.problem.model import Model
 from fits.problem.noise import information_weights, log_density, named_residual, tail_residual
 from tests.helpers.models import design, line, measured
 
@@ -79,7 +80,7 @@ def test_problem_against_a_likelihood_written_out(name: str) -> None:
         sigma = np.sqrt((SIGMA**2 if noise.use_sigma else 0.0) + (relative * predicted) ** 2 + floor**2)
         law = stats.norm if noise.tails == "gaussian" else stats.t(3.0)
         each = law.logpdf((VALUES - predicted) / sigma) - np.log(sigma)
-        np.testing.assert_allclose(problem.log_likelihood_per_datum(vector), each, rtol=1e-10)
+        np.testing.assert_allclose(problem.call(Model.log_likelihood_per_datum_at, vector, predicted), each, rtol=1e-10)
         assert float(problem.log_likelihood(vector)) == pytest.approx(each.sum(), rel=1e-12)
         priors = stats.norm.logpdf(named["['b']"], 0.3, 0.5) + stats.norm.logpdf(np.log(named["scale"]), 0, 0.1)
         half = 0.5 * float(np.sum(np.square(problem.residuals(vector))))

@@ -43,7 +43,7 @@ def test_a_sheet_is_also_seen_from_behind() -> None:
 
 def test_bad_arguments_are_named() -> None:
     for size in (4, 1025, 100_000):
-        with pytest.raises(ValueError, match=rf"size is {size}, must be in \[16, 1024\] pixels"):
+        with pytest.raises(ValueError, match=rf"size: {size} is not a whole number from 16 to 1024"):
             render(WHITE, SINGLE, size=size)
     with pytest.raises(ValueError, match=r"layers: the stack ends in a medium of index 1\.5, .* Interface of ior 1"):
         render(lj.Stack([lj.Interface(1.5, 0.2)]), size=16)

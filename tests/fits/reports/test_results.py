@@ -46,10 +46,10 @@ def assert_same(loaded: Fit, saved: Fit) -> None:
 def unfitted(coat_fit: Fit, **settings: Any) -> Fit:
     """A `Fit` of the same data that stands at the start of its problem, made without running an optimiser."""
     problem = Problem(coat_fit.problem.stack, coat_fit.problem.data, **settings)
-    minimum = Minimum(dict(zip(problem.names, problem.start, strict=True)), 1.5, 1)
+    minimum = Minimum(dict(zip(problem.names, problem.start, strict=True)), 1.5, 1, True)
     direction = Direction(np.inf, {problem.names[0]: 1.0}, {problem.names[0]: np.inf})
     found = {"vector": problem.start, "errors": np.full(len(problem.start), 0.1), "unidentified": (direction,)}
-    found |= {"covariance": 0.01 * np.eye(len(problem.start)), "minima": (minimum,), "alternatives": (minimum,)}
+    found |= {"covariance": 0.01 * np.eye(len(problem.start)), "minima": (minimum,)}
     return replace(coat_fit, problem=problem, **found)
 
 

@@ -11,8 +11,9 @@ from matplotlib.figure import Figure
 
 from fits import Direction, Discrepancy, Fit, Noise, Problem, fit
 from fits.data.scans import correlation, neighbours, signed_angle
+from fits.prediction.predict import with_discrepancy
 from fits.reports import tables, verdicts
-from fits.reports.plots.data import bsdf, curves_picture, misfit
+from fits.reports.plots.data import curves_picture, misfit
 from fits.reports.verdicts import assess, identifiability, standardised
 from tests.helpers.models import POSITIVE_LINE, SCANS, along, line, wrong_line
 
@@ -103,7 +104,7 @@ def test_the_verdict_is_three_sentences_and_quotes_the_misfit(coat_fit: Fit) -> 
     half, most = map(float, re.findall(r"([\d.e-]+) %", found.sentences[0])[::2])
     assert np.mean(errors < 0.01 * half) == pytest.approx(0.5, abs=0.05)
     assert np.mean(errors < 0.01 * most) == pytest.approx(0.95, abs=0.05)
-    other = replace(coat_fit, alternatives=coat_fit.minima[:1])
+    other = replace(coat_fit, minima=(replace(coat_fit.minima[0], equivalent=True),))
     bad = (
         {"fit": replace(coat_fit, converged=False)},
         {"fit": other},
@@ -159,7 +160,8 @@ def test_both_curves_are_drawn_and_the_residuals_are_those_of_the_one_with_the_d
     data = fitted.problem.data
     rows = np.flatnonzero(np.isclose(data.theta_i, 10.0))
     angle, values = signed_angle(data)[rows], data.values[rows, 0]
-    for label, expected in (("model with discrepancy", bsdf(fitted)), ("without discrepancy", fitted.predicted)):
+    whole = with_discrepancy(fitted, data.wi, data.wo, fitted.predicted)
+    for label, expected in (("model with discrepancy", whole), ("without discrepancy", fitted.predicted)):
         drawn = np.interp(angle, *curves[label].get_data())
         np.testing.assert_allclose(drawn, expected[rows, 0], rtol=1e-6)  # these angles are points of the curve
     (points,) = (line for line in lower.lines if len(np.asarray(line.get_xdata())) == len(rows))
