@@ -1,12 +1,12 @@
-"""Levenberg-Marquardt within a box, on the normal equations; and through a model.
+"""Levenberg-Marquardt within a box, on the normal equations, as an optimistix solver; and through a model.
 
-A transform to an unconstrained space would send a parameter whose best value lies on its bound to infinity, where
-gradients vanish. Here the iterate stays in the box: parameters that push against a bound are held there, the others
-take a damped Gauss-Newton step, and what would leave the box is put on its face (projected Levenberg-Marquardt,
-Kanzow, Yamashita and Fukushima 2004). The few columns of the Jacobian are carried forward together and only J'J and
-J'r are kept, which is several times faster than a QR decomposition of J when there are many more residuals than
-parameters. Columns are scaled to unit length first, so that units do not matter to the damping (after Marquardt 1963;
-its update after Nielsen 1999).
+optimistix has no bounds, and a transform to an unconstrained space sends a parameter whose best value lies on its bound
+to infinity, where gradients vanish. Here the iterate stays in the box: parameters that push against a bound are held
+there, the others take a damped Gauss-Newton step, and what would leave the box is put on its face (projected
+Levenberg-Marquardt, Kanzow, Yamashita and Fukushima 2004). The few columns of the Jacobian are carried forward together
+and only J'J and J'r are kept, which is several times faster than a QR decomposition of J when there are many more
+residuals than parameters. Columns are scaled to unit length first, so that units do not matter to the damping (after
+Marquardt 1963; its update after Nielsen 1999).
 
 To compile the Jacobian of a costly transport takes longer than most fits take to run. So it is a program by itself,
 which fits with and without discrepancy share, and the others see the model as linear at a trial (`Problem.linearise`).
@@ -20,6 +20,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optimistix as optx
 from jax import Array
 
 from fits.data.geometry import Floats
@@ -145,6 +146,50 @@ def step(
     )
 
 
+class BoxLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
+    """`step` as a solver of optimistix, for vectors in the unit box.
+
+    The auxiliary output of the function is a pair; of its second part the Jacobian is kept, in the state.
+    Its options are the arguments of `step`, "damping" at the start, and "most_steps". A start that is not finite, or a
+    stall away from a minimum, gives `optx.RESULTS.nonlinear_divergence`. Statistics have the last `State` as "state".
+    """
+
+    rtol: float = RELATIVE_TOLERANCE
+    atol: float = 0.0
+    norm: Callable[[Any], Array] = optx.max_norm
+
+    def init(self, fn: Any, y: Array, args: Any, options: Any, f_struct: Any, aux_struct: Any, tags: Any) -> State:
+        """State before the first evaluation."""
+        auxiliary = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), aux_struct)
+        watched = jax.tree.map(lambda leaf: jnp.zeros((y.size, *leaf.shape), leaf.dtype), aux_struct[1])
+        return first_state(y, options.get("damping", FIRST_DAMPING), auxiliary, watched)
+
+    def step(self, fn: Any, y: Array, args: Any, options: Any, state: State, tags: Any) -> tuple[Array, State, Any]:
+        """One evaluation, at the trial."""
+
+        def residuals(point: Array) -> tuple[Any, Any, Any]:
+            found, auxiliary = fn(point, args)
+            return found, auxiliary, auxiliary[1]
+
+        state = step(residuals, state, options.get("tolerance"), options.get("logarithmic", ()))
+        return state.point, state, state.auxiliary
+
+    def terminate(
+        self, fn: Any, y: Array, args: Any, options: Any, state: State, tags: Any
+    ) -> tuple[Array, optx.RESULTS]:
+        """Whether to stop, and why."""
+        running = ~(state.ended | (state.steps >= options.get("most_steps", jnp.inf)))
+        short = optx.RESULTS.where(state.ended, optx.RESULTS.successful, optx.RESULTS.nonlinear_max_steps_reached)
+        result = optx.RESULTS.where(state.failed, optx.RESULTS.nonlinear_divergence, short)
+        return ~running, optx.RESULTS.where(running, optx.RESULTS.successful, result)
+
+    def postprocess(
+        self, fn: Any, y: Array, aux: Any, args: Any, options: Any, state: State, tags: Any, result: Any
+    ) -> tuple[Array, Any, dict[str, Any]]:
+        """The solution, and what is known there."""
+        return y, state.auxiliary, {"state": state}
+
+
 def _normal_equations(
     residuals_of: Callable[[Array], tuple[Any, Any, Any]], y: Array, logarithmic: tuple[int, ...]
 ) -> tuple[Array, Array, Array, Any, Any]:
@@ -265,7 +310,8 @@ def _initial(model: Any, unit: Array, fresh: Array) -> tuple[State, Array, Array
     vector = model.box.from_unit(unit)
     held = model.objective == "likelihood" and model.varying
     predicted, rows = jax.eval_shape(model.linearised(model.nothing_known).linear_parts, vector)[1]
-    auxiliary, watched = jnp.zeros_like(predicted), jnp.zeros((unit.size, *rows.shape), rows.dtype)
+    auxiliary = jnp.zeros(predicted.shape, predicted.dtype), jnp.zeros(rows.shape, rows.dtype)
+    watched = jnp.zeros((unit.size, *rows.shape), rows.dtype)
     state = first_state(unit, jnp.where(fresh, FIRST_DAMPING, NEARBY), auxiliary, watched)
     return state, vector, model.initial_sigma(vector) if held else jnp.full((1, 1), jnp.nan)
 
@@ -276,20 +322,22 @@ def _advance(
     """A step by what is known at its trial; and the physical vectors, (P,), of the best point and the next trial."""
     near, varying = model.linearised(known), _varying(model)
     first_step = (jnp.where(rough, sigma, jnp.nan), jnp.where(rough, 0.0, 1.0)) if varying else None
+    options = {
+        "tolerance": tolerance if model.objective == "likelihood" else None,
+        "logarithmic": model.logarithmic if varying else (),
+    }
 
-    def residuals(unit: Array) -> Any:
-        found, (predicted, rows) = near.linear_parts(model.box.from_unit(unit), first_step)
-        return found, predicted, rows
+    def residuals(unit: Array, _: None) -> Any:
+        return near.linear_parts(model.box.from_unit(unit), first_step)
 
-    enough = tolerance if model.objective == "likelihood" else None
-    state = step(residuals, state, enough, model.logarithmic if varying else ())
+    _, state, _ = BoxLevenbergMarquardt().step(residuals, state.point, None, options, state, frozenset())
     return state, model.box.from_unit(state.point), model.box.from_unit(state.trial)
 
 
 def _end(state: State, vector: Array, steps: int) -> Descent:
     """What is known where a descent ended, at a physical vector (P,)."""
     finite = bool(np.isfinite(state.cost))
-    predicted = np.asarray(state.auxiliary, float)
+    predicted = np.asarray(state.auxiliary[0], float)
     return Descent(
         vector=np.asarray(vector, float),
         cost=float(state.cost) if finite else math.inf,

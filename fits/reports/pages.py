@@ -9,7 +9,7 @@ from string import Template
 
 import layerjax
 
-PACKAGES = ("jax", "equinox", "emcee", "numpy", "scipy")
+PACKAGES = ("jax", "equinox", "optimistix", "emcee", "numpy", "scipy")
 
 
 @dataclass(frozen=True)

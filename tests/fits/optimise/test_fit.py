@@ -3,13 +3,14 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optimistix as optx
 import pytest
 from scipy.optimize import least_squares
 
 import layerjax as lj
 from fits import Direction, FitOptions, Free, LogNormal, LogUniform, Noise, Normal, Problem, fit, simulate, slices
 from fits.optimise.fit import start_points
-from fits.optimise.levenberg_marquardt import COST_TOLERANCE
+from fits.optimise.levenberg_marquardt import COST_TOLERANCE, BoxLevenbergMarquardt
 from fits.optimise.options import options_from
 from fits.problem.compilation import _program
 from fits.reports import verdicts
@@ -70,6 +71,23 @@ def test_the_gradient_of_the_posterior_agrees_with_differences():
     for index, step in enumerate(np.eye(6) * h):
         up, down = (float(problem.call(value_and_gradient, u + sign * step)[0]) for sign in (1.0, -1.0))
         np.testing.assert_allclose(gradient[index], (up - down) / (2.0 * h), rtol=1e-6)
+
+
+def test_optimistix_runs_the_solver_within_the_box():
+    """Rosenbrock's valley, whose minimum lies in the box or beyond it, beside scipy."""
+    for scale in (2.0, 0.8):
+
+        def residuals(y, args, scale=scale):
+            x = scale * y
+            return jnp.stack([10.0 * (x[1] - x[0] ** 2), 1.0 - x[0]]), (x, x)
+
+        found = optx.least_squares(
+            residuals, BoxLevenbergMarquardt(), jnp.array([0.1, 0.9]), has_aux=True, max_steps=200
+        )
+        expected = least_squares(lambda y, of=residuals: np.asarray(of(y, None)[0]), [0.1, 0.9], bounds=(0.0, 1.0))
+        np.testing.assert_allclose(found.value, expected.x, atol=1e-4)
+        np.testing.assert_allclose(found.aux[0], scale * found.value, rtol=1e-6)
+        np.testing.assert_allclose(found.stats["state"].watched, scale * np.eye(2), rtol=1e-6)
 
 
 def test_starts_are_seeded_and_fill_the_box():
