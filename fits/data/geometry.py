@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
-Truths = NDArray[np.bool_]
+Booleans = NDArray[np.bool_]
 
 LIGHT_AZIMUTH = 180.0  # degrees; the plane of incidence is x-z and the mirror direction lies at azimuth 0
 AT_NORMAL = 1e-6  # degrees from the normal below which a direction has no azimuth

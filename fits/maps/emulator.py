@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from scipy import fft
 from scipy.stats import qmc
 
-from fits.data.geometry import Floats, Integers, Truths
+from fits.data.geometry import Floats, Integers, Booleans
 from fits.maps.options import DEFAULT, MapOptions
 from fits.problem.compilation import cores, in_shares
 from fits.problem.model import Model
@@ -115,7 +115,7 @@ class _Space:
     places: Integers
     low: Floats
     high: Floats
-    logarithmic: Truths
+    logarithmic: Booleans
 
     def vectors(self, points: Floats) -> Floats:
         """Parameters (G, P) at points (G, D) of [-1, 1]."""

@@ -19,7 +19,7 @@ import zarr
 
 from fits._files import require_there
 from fits.data.formats.csv import read_directions
-from fits.data.geometry import Floats, Geometry, Pairs, Truths, direction
+from fits.data.geometry import Floats, Geometry, Pairs, Booleans, direction
 from fits.engines import one_line
 from fits.store import fingerprint
 
@@ -168,7 +168,7 @@ class Measured(NamedTuple):
 
     values: Floats
     sigma: Floats | None
-    mask: Truths
+    mask: Booleans
     wi: Floats | None
     wo: Floats | None
 
@@ -219,7 +219,7 @@ class MapData:
             wi, wo = _unit_vectors(directions, mask, f" in block {block_words(block)}")
         return Measured(self._expanded(self.values, block), sigma, mask, wi, wo)
 
-    def read_mask(self, block: Block) -> Truths:
+    def read_mask(self, block: Block) -> Booleans:
         """Which texels of a block take part: all if there is no mask."""
         if self.mask is None:
             return np.ones([one.stop - one.start for one in block], bool)
@@ -328,7 +328,7 @@ def _directions(geometry: Any, arrays: Arrays) -> Arrays:
     return {name: arrays[name] for name in names}
 
 
-def _unit_vectors(directions: Mapping[str, Floats], used: Truths, where: str) -> tuple[Floats, Floats]:
+def _unit_vectors(directions: Mapping[str, Floats], used: Booleans, where: str) -> tuple[Floats, Floats]:
     """`wi` and `wo`, (block shape, N, 3), refused where one of a `used` texel is none, along the normal elsewhere."""
     if "wi" not in directions:
         for name in ("theta_i", "theta_o"):

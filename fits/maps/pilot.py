@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 import layerjax as lj
-from fits.data.geometry import Floats, Truths
+from fits.data.geometry import Floats, Booleans
 from fits.data.measurements import Measurements, channel_names
 from fits.maps.common import fit_common, with_common
 from fits.maps.emulator import Emulator, emulate
@@ -65,7 +65,7 @@ class Job:
         """The store, opened once in each process."""
         return Store(self.path)
 
-    def texels(self, block: Block) -> tuple[Truths, Texels]:
+    def texels(self, block: Block) -> tuple[Booleans, Texels]:
         """Which texels of a block take part, (block shape), and those of the block, one after the other."""
         measured = self.data.read(block)
         return measured.mask, texels_of(measured)

@@ -11,7 +11,7 @@ import numpy as np
 from jax import Array
 from scipy import stats
 
-from fits.data.geometry import Floats, Integers, Truths
+from fits.data.geometry import Floats, Integers, Booleans
 from fits.maps.options import MapOptions
 from fits.maps.texels import Fits, Linearisation, Texels, fit_texels, linearise_at, to_units
 from fits.problem.model import Model
@@ -59,7 +59,7 @@ def fit_pilot_texels(problem: Problem, points: Floats, texels: Texels, options: 
     return search(problem, starts, texels, options)[0]
 
 
-def search(problem: Problem, starts: Starts, texels: Texels, options: MapOptions) -> tuple[Fits, Truths, Truths]:
+def search(problem: Problem, starts: Starts, texels: Texels, options: MapOptions) -> tuple[Fits, Booleans, Booleans]:
     """The fits of M texels, and which of them are poor or were fitted again, (M,) each."""
     size = options.chunk_size
     order = likeliest(problem, starts, texels, size, options.restarts + 1)
@@ -73,7 +73,7 @@ def search(problem: Problem, starts: Starts, texels: Texels, options: MapOptions
         freedom = np.maximum(texels.measurements - len(problem.names), 1)
         limit = np.maximum(starts.explained, stats.chi2.isf(options.poor_probability, freedom) / freedom)
 
-    def poor() -> Truths:
+    def poor() -> Booleans:
         """Which fits are worse than noise and pilot explain, or have not converged."""
         return ~((reduced_chi_square(best, texels) <= limit) & best.converged)
 

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from fits._files import plain
-from fits.data.geometry import Floats, Truths
+from fits.data.geometry import Floats, Booleans
 from fits.engines import Failure, run
 from fits.maps.inputs import Block, block_words
 from fits.maps.options import Kind, MapOptions
@@ -27,7 +27,7 @@ from fits.maps.texels import fit_texels, standard_errors, to_units, widths
 FLAT = 0.1  # of the scale: below, a difference counts by its square in a total variation, which has no derivative at 0
 
 
-def neighbour_prior(kind: Kind, scales: Floats, units: Floats, fitted: Truths) -> tuple[Floats, Floats]:
+def neighbour_prior(kind: Kind, scales: Floats, units: Floats, fitted: Booleans) -> tuple[Floats, Floats]:
     """The Gaussian by which the neighbours of each texel hold it: its centre in the unit box and its precision, 0 where
     no edge ends, (map shape, P) each.
 
@@ -54,7 +54,7 @@ class Half(NamedTuple):
     strongly their neighbours hold them, see `Texels`."""
 
     block: Block
-    mine: Truths
+    mine: Booleans
     units: Floats
     centre: Floats
     inverse_sd: Floats

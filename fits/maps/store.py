@@ -25,7 +25,7 @@ from zarr.core.sync import sync
 
 from fits._files import PARTIAL, given_path, named, plain, replacing, require_there, restore
 from fits._lazy import shown_by
-from fits.data.geometry import Floats, Truths
+from fits.data.geometry import Floats, Booleans
 from fits.engines import one_line
 from fits.maps.inputs import Block
 from fits.maps.options import MapOptions
@@ -173,7 +173,7 @@ class FittedMap:
         """The share of texels that are there."""
         return float(np.mean(self.flags != 0))
 
-    def has(self, meaning: str) -> Truths:
+    def has(self, meaning: str) -> Booleans:
         """Which texels have a flag.
 
         Args:

@@ -18,7 +18,7 @@ import numpy as np
 from jax import Array
 from jax.flatten_util import ravel_pytree
 
-from fits.data.geometry import Floats, Integers, Truths
+from fits.data.geometry import Floats, Integers, Booleans
 from fits.optimise.levenberg_marquardt import COST_TOLERANCE, FIRST_DAMPING, NEARBY, State, first_state
 from fits.optimise.levenberg_marquardt import step as step_of
 from fits.optimise.multi_start import MOST_STEPS
@@ -133,7 +133,7 @@ class Fits(NamedTuple):
     predicted: Any
 
     @property
-    def finite(self) -> Truths:
+    def finite(self) -> Booleans:
         """Which have a value."""
         return np.isfinite(self.cost) & np.all(np.isfinite(self.vector), axis=1)
 
@@ -194,7 +194,7 @@ def widths(problem: Problem, vectors: Floats) -> Floats:
     return np.asarray(problem.model.box.slope(jnp.asarray(vectors)), float)
 
 
-def standard_errors(problem: Problem, fits: Fits, texels: Texels) -> tuple[Floats, Truths, Truths]:
+def standard_errors(problem: Problem, fits: Fits, texels: Texels) -> tuple[Floats, Booleans, Booleans]:
     """As `fits.optimise.uncertainty`, of M fits: standard errors (M, P), NaN where a bound holds the parameter and
     infinite where nothing does; which are at a bound, (M, P); in which texels the data leave a parameter unidentified,
     (M,)."""

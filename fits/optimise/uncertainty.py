@@ -13,7 +13,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from fits.data.geometry import Floats, Truths
+from fits.data.geometry import Floats, Booleans
 from fits.optimise.levenberg_marquardt import evaluate_at
 from fits.problem.problem import FittingProblem
 
@@ -68,7 +68,7 @@ class Uncertainty:
     resolve. insensitive: names of those that the data say nothing about. predicted: (N, C), in 1/sr, there.
     """
 
-    at_bound: Truths
+    at_bound: Booleans
     standard_errors: Floats
     covariance: Floats
     condition_number: float
@@ -107,14 +107,14 @@ def scatter(problem: FittingProblem, cost: Any, count: Any) -> Any:
     return np.maximum(2.0 * cost / np.maximum(count - len(problem.names), 1), np.finfo(np.float32).tiny)
 
 
-def held_by_bounds(unit: Floats, gradient: Floats, least: Any = LEAST_GRADIENT) -> Truths:
+def held_by_bounds(unit: Floats, gradient: Floats, least: Any = LEAST_GRADIENT) -> Booleans:
     """Which parameters lie on a bound of the unit box and would go beyond it; least: gradient that counts."""
     return ((unit <= ON_BOUND) & (gradient > least)) | ((unit >= 1.0 - ON_BOUND) & (gradient < -least))
 
 
 def errors_in_boxes(
     root: Floats, prior: Floats, unit: Floats, gradient: Floats, least: Any
-) -> tuple[Truths, Truths, Floats, Floats]:
+) -> tuple[Booleans, Booleans, Floats, Floats]:
     """At an optimum, or at each of many: which parameters the data say nothing about, and which a bound holds,
     (..., P); D, (..., rows, P), whose D'D is the covariance; and standard errors, (..., P), NaN at a bound, infinite
     where nothing holds a parameter. root, prior: rows A of the data and the prior, (..., rows, P); least: as above.

@@ -245,7 +245,7 @@ def compare(
 
 
 def pack(truths: Mapping[str, Truth]) -> bytes:
-    """Truths by stack as the bytes of an .npz file."""
+    """Booleans by stack as the bytes of an .npz file."""
     arrays = {f"{name}/{part}": value for name, truth in truths.items() for part, value in vars(truth).items()}
     buffer = io.BytesIO()
     np.savez_compressed(buffer, **arrays)
