@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from scipy import fft
 from scipy.stats import qmc
 
-from fits.data.geometry import Floats, Integers, Booleans
+from fits.data.geometry import Booleans, Floats, Integers
 from fits.maps.options import DEFAULT, MapOptions
 from fits.problem.compilation import cores, in_shares
 from fits.problem.model import Model

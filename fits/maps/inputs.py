@@ -19,7 +19,7 @@ import zarr
 
 from fits._files import require_there
 from fits.data.formats.csv import read_directions
-from fits.data.geometry import Floats, Geometry, Pairs, Booleans, direction
+from fits.data.geometry import Booleans, Floats, Geometry, Pairs, direction
 from fits.engines import one_line
 from fits.store import fingerprint
 

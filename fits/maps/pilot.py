@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 import layerjax as lj
-from fits.data.geometry import Floats, Booleans
+from fits.data.geometry import Booleans, Floats
 from fits.data.measurements import Measurements, channel_names
 from fits.maps.common import fit_common, with_common
 from fits.maps.emulator import Emulator, emulate

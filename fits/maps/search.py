@@ -11,7 +11,7 @@ import numpy as np
 from jax import Array
 from scipy import stats
 
-from fits.data.geometry import Floats, Integers, Booleans
+from fits.data.geometry import Booleans, Floats, Integers
 from fits.maps.options import MapOptions
 from fits.maps.texels import Fits, Linearisation, Texels, fit_texels, linearise_at, to_units
 from fits.problem.model import Model

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from fits._files import plain
-from fits.data.geometry import Floats, Booleans
+from fits.data.geometry import Booleans, Floats
 from fits.engines import Failure, run
 from fits.maps.inputs import Block, block_words
 from fits.maps.options import Kind, MapOptions

@@ -25,7 +25,7 @@ from zarr.core.sync import sync
 
 from fits._files import PARTIAL, given_path, named, plain, replacing, require_there, restore
 from fits._lazy import shown_by
-from fits.data.geometry import Floats, Booleans
+from fits.data.geometry import Booleans, Floats
 from fits.engines import one_line
 from fits.maps.inputs import Block
 from fits.maps.options import MapOptions

@@ -18,7 +18,7 @@ import numpy as np
 from jax import Array
 from jax.flatten_util import ravel_pytree
 
-from fits.data.geometry import Floats, Integers, Booleans
+from fits.data.geometry import Booleans, Floats, Integers
 from fits.optimise.levenberg_marquardt import COST_TOLERANCE, FIRST_DAMPING, NEARBY, State, first_state
 from fits.optimise.levenberg_marquardt import step as step_of
 from fits.optimise.multi_start import MOST_STEPS

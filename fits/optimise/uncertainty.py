@@ -13,7 +13,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from fits.data.geometry import Floats, Booleans
+from fits.data.geometry import Booleans, Floats
 from fits.optimise.levenberg_marquardt import evaluate_at
 from fits.problem.problem import FittingProblem
 
