@@ -25,6 +25,7 @@ from fits.sampling.options import SamplerOptions
 ADDED_AFTER = (25 * 1.5 ** np.arange(40.0)).astype(int)
 # length of differential evolution; 2.38 is best for a normal posterior, but curved ones are narrower than they are long
 DIFFERENCE = 1.2
+LOOKED_AT = 64  # steps among those since the last addition: where walkers stay they are seen all the same
 FIRST_DRAWS = 512  # of the approximation that a chain begins with
 EFFICIENCY = 0.4  # effective draws of it to draws, at which it needs no more components
 
@@ -64,11 +65,10 @@ class Ensemble:
         if since == chain.iteration or chain.iteration not in ADDED_AFTER:
             return mixture
         chain.write()  # before the moves that follow from it
-        count = chain.shape[1]
-        seen, first = np.unique(chain.chain[since : chain.iteration].reshape(-1, count), axis=0, return_index=True)
-        height = chain.log_prob[since : chain.iteration].ravel()[first]
+        count, every = chain.shape[1], slice(since, chain.iteration, -(-(chain.iteration - since) // LOOKED_AT))
+        seen, first = np.unique(chain.chain[every].reshape(-1, count), axis=0, return_index=True)
         with one_thread():  # the same to the last bit, whatever else runs
-            top = np.argsort(mixture.log_density(seen) - height)[: 2 * COMPONENTS]
+            top = np.argsort(mixture.log_density(seen) - chain.log_prob[every].ravel()[first])[: 2 * COMPONENTS]
             spread = np.atleast_2d(np.cov(chain.steps()[chain.iteration // 2 :].reshape(-1, count).T))
         added = components_at(self.problem, seen[top], spread)
         mixture = mixture.extended(added, len(top) / (len(mixture.centre) + len(top)))

@@ -13,6 +13,7 @@ from scipy.special import expit, gammaln, logit, logsumexp
 from fits.data.geometry import Floats
 
 DEGREES_OF_FREEDOM = 3.0  # tails heavier than those of a posterior: where they are lighter, walkers stay
+ROWS = 1024  # positions at a time: less memory
 NARROWEST, INSIDE = 1e-9, 1e-9  # in log-odds; of the box
 
 
@@ -83,6 +84,10 @@ class Mixture:
 
     def log_parts(self, positions: Floats) -> Floats:
         """What every component adds to the density, as logarithms, (M, count)."""
+        blocks = np.array_split(positions, 1 + len(positions) // ROWS)
+        return np.concatenate([self._log_parts(block) for block in blocks], axis=1)
+
+    def _log_parts(self, positions: Floats) -> Floats:
         power, level = self._of_components
         found = level[:, None] - power[:, None] * np.log1p(self.squared_distance(positions) / DEGREES_OF_FREEDOM)
         if self.at_bound.any():
