@@ -1,4 +1,4 @@
-"""Do samplers agree, and which is fast? emcee with and without fitted proposals, and NUTS, on difficult posteriors."""
+"""Do samplers agree, and which is fast? emcee with and without independent proposals, and NUTS, on difficult posteriors."""
 
 import json
 import time
@@ -27,7 +27,7 @@ QUANTILES = (0.158655, 0.5, 0.841345)
 PLAIN = "emcee"
 SAMPLERS: dict[str, dict[str, Any]] = {
     PLAIN: {},
-    "emcee, none fitted": {"options": fits.SamplerOptions(independent=0.0)},
+    "emcee, none independent": {"options": fits.SamplerOptions(independent=0.0)},
     "NUTS": {"sampler": "nuts"},
 }
 

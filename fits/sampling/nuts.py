@@ -1,7 +1,7 @@
 """A few chains of the No-U-Turn sampler (Hoffman and Gelman 2014) by blackjax: for many parameters.
 
 Each begins with a draw of Laplace's approximation, whose covariance is the first metric, and finds its own metric and
-step size by blackjax's window adaptation. A step is a trajectory after a jump to a draw of the fitted mixture, which is
+step size by blackjax's window adaptation. A step is a trajectory after a jump to a draw of the mixture, which is
 taken by the rule of Metropolis and Hastings: trajectories alone never find another mode. blackjax is an extra.
 """
 

@@ -39,7 +39,7 @@ def test_a_tiny_run_goes_on_where_it_was(tmp_path: Path, monkeypatch: pytest.Mon
         samplers.study(directory=tmp_path, report=cut_short, **options)
     said: list[str] = []
     text, paths = samplers.study(directory=tmp_path, report=said.append, resume=True, **options)
-    assert [line.partition(":")[0] for line in said] == ["line, emcee, none fitted", "line, NUTS"]
+    assert [line.partition(":")[0] for line in said] == ["line, emcee, none independent", "line, NUTS"]
     assert sorted(paths) == sorted(tmp_path.iterdir())
     assert paths[1].read_text() == text
     chains = json.loads(paths[0].read_text())["chains"]
