@@ -1,4 +1,4 @@
-"""Do samplers agree, and which is fast? emcee with and without independent proposals, and NUTS, on difficult posteriors."""
+"""Do samplers agree, and which is fast? emcee, also without independent proposals, and NUTS, on hard posteriors."""
 
 import json
 import time
