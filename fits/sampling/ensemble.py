@@ -103,4 +103,5 @@ def first_mixture(fit: Fit, seed: int, options: SamplerOptions, progress: Progre
 def propose(mixture: Mixture, positions: Floats, generator: np.random.RandomState) -> tuple[Floats, Floats]:
     """Draws in place of `positions` (count, P), and the log-ratio of densities that `emcee.moves.MHMove` asks for."""
     drawn = mixture.draw(generator, len(positions))
-    return drawn, mixture.log_density(positions) - mixture.log_density(drawn)
+    before, after = np.split(mixture.log_density(np.concatenate([positions, drawn])), 2)
+    return drawn, before - after
