@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, fields
 
+from fits.sampling.options import MAX_PARETO_K
 from layerjax._checks import require_count, require_number
 
 
@@ -29,7 +30,7 @@ class ComparisonOptions:
     decisive_per_measurement: float = 1.0
     slight_difference: float = 2.0
     clear_difference: float = 10.0
-    max_pareto_k: float = 0.7
+    max_pareto_k: float = MAX_PARETO_K
     max_reduced_chi_square: float = 2.0
     min_incidences: int = 3
     scan_parts: int = 5

@@ -29,9 +29,10 @@ from fits.problem.instrument import gain_unknown
 from fits.problem.model import Model
 from fits.problem.problem import polar_angles
 from fits.problem.simulate import require_visible
-from fits.sampling.importance import MAX_PARETO_K, importance_draws
+from fits.sampling.importance import importance_draws
 from fits.sampling.initial import normal_draws
 from fits.sampling.mixture import Mixture
+from fits.sampling.options import MAX_PARETO_K
 from fits.sampling.posterior import Posterior
 from layerjax._checks import in_short, require_count, require_kind, require_number, require_seed
 from layerjax.compiling import programs_kept

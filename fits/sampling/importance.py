@@ -21,9 +21,8 @@ from fits.problem.problem import Problem
 from fits.progress import Progress, silent
 from fits.sampling.initial import initial_mixture, log_posteriors
 from fits.sampling.mixture import NARROWEST, Mixture
-from fits.sampling.options import SamplerOptions
+from fits.sampling.options import MAX_PARETO_K, SamplerOptions
 
-MAX_PARETO_K = 0.7  # above it a part of the posterior may be missing
 FINITE_VARIANCE = 0.5  # Pareto k below which the variance of weights is finite
 MIN_EFFECTIVE_DRAWS = 50
 FEWEST = 200  # draws, of whose spread something can be said
@@ -83,7 +82,7 @@ def importance_draws(
     The fit is of a likelihood. share: see `log_posteriors`. initial: mixture that is drawn from first, in place of
     approximations about the minima of the fit. progress: called with ("approximation", rounds, the most, note).
     """
-    problem, fewest = fit.problem, ROUNDS_ALONG_RIDGES if fit.unidentified and initial is None else 0
+    problem, least_rounds = fit.problem, ROUNDS_ALONG_RIDGES if fit.unidentified and initial is None else 0
     mixture = initial or initial_mixture(fit, share, smallest_mode)
     positions = mixture.draw(generator, max(draws, FEWEST))
     log_posterior, log_density = log_posteriors(problem, positions, share), mixture.log_density(positions)
@@ -92,7 +91,7 @@ def importance_draws(
         found = ImportanceDraws(positions, weights, _pareto_k(weights), mixture)
         enough = max(MIN_EFFECTIVE_DRAWS, efficiency * len(positions))
         suffices = found.pareto_k < max_pareto_k and found.effective_sample_size >= enough
-        if (suffices and number >= fewest) or number == ROUNDS or not np.isfinite(weights).any():
+        if (suffices and number >= least_rounds) or number == ROUNDS or not np.isfinite(weights).any():
             break
         progress("approximation", number, ROUNDS, f"{found.effective_sample_size / len(positions):.0%} efficient")
         even = _tempered(weights)

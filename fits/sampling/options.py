@@ -50,4 +50,5 @@ class SamplerOptions:
         require_number("independent", self.independent, 0.0, 0.99)
 
 
+MAX_PARETO_K = 0.7  # of importance weights: above it a part of the posterior may be missing (Vehtari et al. 2024)
 FIRST_CHECK = 100  # steps after which a chain is first looked at
