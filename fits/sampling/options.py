@@ -15,8 +15,8 @@ class SamplerOptions:
             parameter.
         r_hat: of a converged chain, at most (Vehtari, Gelman, Simpson, Carpenter & Buerkner 2021).
         max_steps: steps after which sampling ends in any case, at least 100.
-        walkers: of emcee, even, at least 2 P + 2 for P parameters (None: 32, or 2 P + 2), or chains of NUTS, at least 2
-            (None: 4).
+        walkers: of emcee, even, at least 2 P + 2 for P parameters (None: 20, or 2 P + 2 where that is more), or chains
+            of NUTS, at least 2 (None: 4).
         burn_in: share of the chain, at its start, that no estimate uses.
         independent: share of emcee's proposals that are drawn from a mixture that approximates the posterior; the
             others depend on where walkers stand.

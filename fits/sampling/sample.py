@@ -25,7 +25,7 @@ from fits.store import Store, another, differences, fingerprint
 from layerjax._checks import require_kind, require_seed
 from layerjax.compiling import programs_kept
 
-WALKERS = 32
+WALKERS = 20  # of which 50 autocorrelation times have about 1,000 effective samples
 PATIENCE = 10.0  # seconds between two looks at a chain that grows slowly, for what progress shows
 
 Sampler = Literal["emcee", "nuts"]
