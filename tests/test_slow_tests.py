@@ -91,6 +91,7 @@ def test_commits_are_numbered() -> None:
     assert commit_number() > 0  # in a folder without history too
 
 
+@pytest.mark.slow
 def test_slow_tests_are_collected_by_their_whole_names() -> None:
     """Whatever options the project gives to pytest."""
     found = collected("tests/test_site.py")

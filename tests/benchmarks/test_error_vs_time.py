@@ -85,6 +85,7 @@ def test_differences_that_timings_cannot_tell_are_no_figures() -> None:
     assert error_tables.time_of_a_value([*found, found[0]], called=False) == "25.0"
 
 
+@pytest.mark.slow
 def test_one_stack_writes_whole_files(tmp_path: Path) -> None:
     """Haze, which compiles fast."""
     haze = lj.Stack([lj.Medium(0.2, 0.5, lj.HenyeyGreenstein(0.3))])

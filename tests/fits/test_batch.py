@@ -177,6 +177,7 @@ def test_held_out_data_decide(folder):
     assert coat["loss"] == pytest.approx(-2.0 * scores.elpd * scores.count, abs=2e-3 * scores.count)
 
 
+@pytest.mark.slow
 def test_processes_give_what_threads_give(folder, whole):
     """A worker knows nothing of the patches here: reports are drawn, where they are wanted."""
     for reports, out in ((True, "out"), (False, "plain")):

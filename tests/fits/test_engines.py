@@ -76,6 +76,7 @@ def test_a_worker_has_the_settings_of_its_parent(client):
         np.testing.assert_array_equal(worker["shared"], large)
 
 
+@pytest.mark.slow
 def test_workers_share_the_tasks_and_one_that_is_killed_costs_nothing(client, tmp_path):
     chance = random.Random(3)
 
@@ -119,7 +120,7 @@ def test_leaving_the_loop_cancels_what_was_submitted(client, tmp_path):
     results = run(tasks.slow, str(tmp_path), range(1000), client=client)
     next(results)
     results.close()
-    wait_until(lambda: not any(client.processing().values()), 10.0)
+    wait_until(lambda: not any(client.processing().values()))
 
 
 def test_a_script_without_a_main_guard_is_refused(tmp_path):
@@ -132,9 +133,8 @@ def test_a_script_without_a_main_guard_is_refused(tmp_path):
     assert '`if __name__ == "__main__":`' in last
 
 
-@pytest.mark.parametrize(
-    "sent", [pytest.param(signal.SIGINT, marks=pytest.mark.slow), signal.SIGKILL], ids=lambda sent: sent.name
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGKILL], ids=lambda sent: sent.name)
 def test_workers_end_with_their_parent(tmp_path, sent):
     """While they work. Ctrl-C goes to all processes of a terminal; a parent that is killed can end nobody."""
     guard = 'if __name__ == "__main__":\n    '

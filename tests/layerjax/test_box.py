@@ -85,6 +85,7 @@ def test_reciprocity_to_rounding(name):
     np.testing.assert_allclose(forward[apart], backward[apart], rtol=1e-11, atol=1e-290)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", STRUCTURES)
 def test_no_draw_gains_energy(name):
     """f |cos| / pdf <= 1 - unscattered for every draw: with exact sampling, energy and delta cannot exceed 1."""

@@ -3,6 +3,8 @@
 import subprocess
 import sys
 
+import pytest
+
 SCRIPT = """
 import jax
 jax.config.update("jax_num_cpu_devices", 2)
@@ -54,6 +56,7 @@ np.testing.assert_allclose(jax.jit(own)(np.tile(wi, (2, 1)), np.tile(wo, (2, 1))
 """
 
 
+@pytest.mark.slow
 def test_two_devices_give_what_one_does() -> None:
     """In a process of its own: devices are made before anything else."""
     done = subprocess.run([sys.executable, "-c", SCRIPT], capture_output=True, text=True, check=False)

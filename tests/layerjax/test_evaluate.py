@@ -58,7 +58,7 @@ def test_an_empty_stack_is_nothing_at_all():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("dtype", [np.float32, pytest.param(np.float64, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_large_batches_run_in_chunks_with_the_same_result(dtype):
     chunk = CHUNK_BYTES // np.dtype(dtype).itemsize
     part = (2 * chunk + chunk // 3) // 14 * 2

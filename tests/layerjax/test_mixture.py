@@ -58,6 +58,7 @@ def test_light_that_passes_straight_is_the_mean() -> None:
     assert mixed.channels == 3
 
 
+@pytest.mark.slow
 def test_walks_are_drawn_for_each_part_by_itself() -> None:
     mixed = lj.Mixture({"haze": HAZE, "fog": FOG}, [0.4, 0.6])
     walk, wi, wo, solver = lj.RandomWalk(paths=2048), WI[:2], WO[:2], lj.AddingDoubling(nodes=8, modes=6)
@@ -114,6 +115,7 @@ def test_mixtures_of_mixtures() -> None:
     np.testing.assert_allclose(found, expected, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_maps_of_weights_and_of_parts() -> None:
     shares = np.linspace(0.0, 1.0, 6).reshape(2, 3)
     alphas = np.linspace(0.1, 0.6, 3)[None] * np.ones((2, 1))

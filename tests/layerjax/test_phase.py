@@ -213,7 +213,8 @@ STACKS = {
 }
 
 
-@pytest.mark.parametrize("name", ["Rayleigh on paint", pytest.param(COATED, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["Rayleigh on paint", COATED])
 def test_the_solver_agrees_with_the_walk(name):
     stack = STACKS[name]
     wo = WO[:3] if stack.base is not None else WO
@@ -233,10 +234,11 @@ def both_sides(count):
 TILTED_SOLVER = lj.AddingDoubling(ordinates=(4, 8))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", IMITATED)
 @pytest.mark.parametrize(
     "transport",
-    [lj.SingleScattering(), pytest.param(TILTED_SOLVER, marks=pytest.mark.slow), lj.RandomWalk(paths=2000)],
+    [lj.SingleScattering(), TILTED_SOLVER, lj.RandomWalk(paths=2000)],
     ids=["SingleScattering", "AddingDoubling", "RandomWalk"],
 )
 def test_an_axis_that_leans_is_carried_as_the_built_in_it_imitates(transport, kind):
@@ -255,6 +257,7 @@ def test_an_axis_that_leans_is_carried_as_the_built_in_it_imitates(transport, ki
     assert scipy.stats.chi2.sf(np.sum(apart**2), apart.size) > SIGNIFICANCE
 
 
+@pytest.mark.slow
 def test_three_axes_of_different_lengths():
     """What no built-in has: reciprocal, its draws carry its energy, and upside down it is its mirror image."""
     phase, (wi, wo) = ellipsoid(0.3, 0.6, 1.0), both_sides(200)

@@ -21,7 +21,9 @@ def test_point_values(name, dtype, tolerance):
     np.testing.assert_allclose(value[0], expected, rtol=tolerance)
 
 
-@pytest.mark.parametrize("name", HEMISPHERES)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name == "three tilted")) for name in HEMISPHERES]
+)
 def test_hemispherical_values(name):
     layers, incident, *references = HEMISPHERES[name]
     wi = lj.direction(*incident)

@@ -112,6 +112,7 @@ W = np.deg2rad(75.0)
 WI, WO = lj.direction(0.6, 0.2), lj.direction(0.9, 2.4)
 
 
+@pytest.mark.slow
 def test_gradients_agree_with_central_differences():
     def value(p, wi, wo):
         return jnp.sum(lj.evaluate(make(p), wi, wo, SINGLE) * jnp.array([1.0, 2.0, 3.0]))
@@ -130,6 +131,7 @@ def test_gradients_agree_with_central_differences():
         np.testing.assert_allclose(ravel_pytree(gradient)[0], numeric, rtol=1e-6, atol=1e-8 * scale)
 
 
+@pytest.mark.slow
 def test_gradients_where_wi_and_wo_are_equally_attenuated():
     # at the mirror image of wi through the plane; |a - b| and min(a, b) have no derivative there, the value has
     def value(x):

@@ -70,6 +70,7 @@ def test_derivatives_at_the_ends(numbers) -> None:
             assert slope == pytest.approx(expected, rel=1e-4, abs=1e-8)
 
 
+@pytest.mark.slow
 def test_it_is_fitted_in_its_units(tmp_path) -> None:
     geometry = fits.slices([10.0, 50.0], np.arange(-75.0, 76.0, 7.5))
     data = fits.simulate(

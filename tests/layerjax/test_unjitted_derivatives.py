@@ -122,6 +122,7 @@ def test_derivatives_of_derivatives(ruled):
     same(hessian(0.4), jax.jit(hessian)(0.4), 1e-9)
 
 
+@pytest.mark.slow
 def test_gradients_of_many_stacks_are_those_of_each(ruled):
     def function(thickness):
         return total("haze")({"thickness": thickness})
@@ -153,6 +154,7 @@ def test_precision_is_that_of_the_directions(ruled):
     same(found, jax.grad(total("haze"))({"base": 0.4}), 1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("ior", "alpha"), [(1.5, 0.01), (0.8, 0.2)])
 def test_single_precision_derivatives_of_interfaces_are_right_to_single_precision(ior, alpha):
     """They are differences in double precision. Differentiated in single precision they would be off by 5e-4."""
@@ -197,11 +199,12 @@ def test_many_numbers_and_large_batches_are_differentiated_on_the_way_back():
     assert seen == [True, False, False, False, False, False]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "transport"),
     [
         ("haze", lj.Statistical()),
-        pytest.param("coat", lj.Statistical(), marks=pytest.mark.slow),
+        ("coat", lj.Statistical()),
         ("haze", lj.SpongeCake()),
         ("varnish", lj.WeidlichWilkie()),
     ],
@@ -212,6 +215,7 @@ def test_published_models_have_the_rule_too(name, transport, ruled):
     assert len(ruled) == 1
 
 
+@pytest.mark.slow
 def test_of_mirrors_statistical_is_traced(ruled):
     """Known to be as narrow as can be, they have a closed form."""
 
@@ -230,6 +234,7 @@ def test_of_other_transports_all_is_traced(ruled):
     assert not ruled
 
 
+@pytest.mark.slow
 def test_another_stack_finds_its_interface_compiled():
     wi, wo = (jnp.asarray(w, jnp.float32) for w in (WI, WO))
 

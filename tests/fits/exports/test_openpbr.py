@@ -75,6 +75,7 @@ def test_a_white_surface_loses_no_light(name):
     np.testing.assert_allclose(albedo(WHITE[name], towards(0.0, 30.0, 60.0, 80.0)), 1.0, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_albedo_is_the_integral_over_light():
     rough = {"coat_roughness": 0.6, "specular_roughness": 0.7}
     surface = Surface(ALL, RED, 0.3, base_metalness=0.5, specular_ior=1.9, **rough)

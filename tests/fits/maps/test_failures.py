@@ -46,7 +46,8 @@ def workers_of(process):
     return workers
 
 
-@pytest.mark.parametrize("kills", [2, pytest.param(50, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("kills", [2, 50])
 def test_killed_at_random_moments(tmp_path, kills):
     """The same command repeated until it has been killed so many times, now and then as a whole and else one of its
     workers, after a few chunks each, at any moment."""

@@ -67,9 +67,12 @@ def test_every_texel_ends_where_a_fit_does_and_others_are_flagged(partial, geome
     "options",
     [
         {"noise": None},
-        {"noise": None, "objective": "cosine_l2"},
+        pytest.param({"noise": None, "objective": "cosine_l2"}, marks=pytest.mark.slow),
         {"noise": fits.Noise(relative=fits.Free(0.05, 1e-3, 0.5), floor=1e-4)},
-        {"noise": NOISE, "instrument": fits.Instrument(detector_aperture=2.0, floor=1e-4, gain_sd=0.01)},
+        pytest.param(
+            {"noise": NOISE, "instrument": fits.Instrument(detector_aperture=2.0, floor=1e-4, gain_sd=0.01)},
+            marks=pytest.mark.slow,
+        ),
     ],
     ids=["assumed noise", "named objective", "fitted noise", "instrument"],
 )
@@ -93,6 +96,7 @@ def test_values_and_errors_are_those_of_a_fit(tmp_path, geometry, measured, opti
         assert map.attributes["pilot"]["rings"] == one.problem.instrument.rings == 1
 
 
+@pytest.mark.slow
 def test_every_texel_may_have_directions_of_its_own(tmp_path, geometry):
     tilts = [np.array([[np.cos(a), 0, np.sin(a)], [0, 1, 0], [-np.sin(a), 0, np.cos(a)]]) for a in (0.0, 0.1, 0.2, 0.3)]
     wo = np.stack([geometry.wo @ tilt.T for tilt in tilts])

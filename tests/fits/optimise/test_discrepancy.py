@@ -34,6 +34,7 @@ def wrong():
     return fitted()
 
 
+@pytest.mark.slow
 def test_a_wrong_shape_is_fitted_with_them(wrong):
     plain = fitted(noise=replace(NOISE, discrepancy=False))
     assert wrong.problem.noise.discrepancy == Discrepancy()

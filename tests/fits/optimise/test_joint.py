@@ -123,6 +123,7 @@ def test_the_posterior_is_that_of_all(joint):
     assert part.inference_data.posterior_predictive["value"].shape[-2:] == (COUNTS["second"], 1)
 
 
+@pytest.mark.slow
 def test_measurements_that_share_nothing_are_each_alone():
     values = design(60) @ [0.9, 0.4]
     noise = np.random.default_rng(3).standard_normal((2, 60)) * [[0.03], [0.05]]

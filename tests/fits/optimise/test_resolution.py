@@ -40,6 +40,7 @@ def refined(sharp, tmp_path_factory):
     return fit(STACK, sharp, starts=2, checkpoint=kept), kept
 
 
+@pytest.mark.slow
 def test_a_fit_is_refined_until_its_error_is_a_tenth_of_the_noise(refined, sharp):
     found, _ = refined
     transport = found.problem.transport

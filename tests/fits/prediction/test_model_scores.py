@@ -91,6 +91,7 @@ def test_errors_by_few_draws_are_told(found: Fit) -> None:
     assert finer.elpd == pytest.approx(sum(exact), abs=4.0 * finer.error)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("known", [False, True])
 def test_held_out_data_of_a_ridge_are_predicted(known: bool) -> None:
     """Only the product of a level and a scale is identified; draws of the whole posterior follow the ridge."""

@@ -65,6 +65,7 @@ def test_wrong_models_need_a_discrepancy() -> None:
     assert np.mean([one.elpd - other.elpd for one, other in zip(with_it, alone, strict=True)]) > 1.0
 
 
+@pytest.mark.slow
 def test_quantiles_are_those_of_the_draws_and_hold_what_they_say() -> None:
     fitted, held_out = split(measurements(3, 0.1))
     at = predict(fitted_to(fitted), held_out)
@@ -97,6 +98,7 @@ def test_directions_below_an_opaque_stack_are_refused(coat_fit: Fit) -> None:
     assert np.all(predict(coat_fit, slices([89.9]), draws=8).mean > 0.0)
 
 
+@pytest.mark.slow
 def test_right_models_lose_little_by_it() -> None:
     fitted, held_out = split(measurements(1, 0.0))
     found = fitted_to(fitted)

@@ -44,6 +44,7 @@ def test_matrices_are_solved_by_one_thread_and_the_others_come_back_after_the_la
         assert threads() == {2}
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/maps").exists(), reason="counts maps")
 @pytest.mark.parametrize(("full", "traced"), [(0.0, 2), (1.0, 1)])
 def test_programs_go_where_a_process_has_no_room_for_more(

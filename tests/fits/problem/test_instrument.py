@@ -97,6 +97,7 @@ def test_light_at_one_polar_angle_has_one_gain() -> None:
     np.testing.assert_array_equal(optics.incidence, theta > 25.0)
 
 
+@pytest.mark.slow
 def test_numbers_are_recovered_by_the_model_of_the_instrument() -> None:
     """A detector of 3 degrees, a sample that leans by 0.3 and gains of 3 %: of 100 repeats 98 lie within three standard
     errors. Without the model of the instrument not one does."""
@@ -195,6 +196,7 @@ def test_a_fit_takes_the_rays_that_the_lobe_asks_for_and_counts_what_is_left() -
     assert lack > 2.0
 
 
+@pytest.mark.slow
 def test_a_broad_lobe_keeps_four_rays() -> None:
     data, seen = through(0.1, 0.2)
     found = fits.fit(FREE, data, transport=SINGLE, noise=NOISE, instrument=seen, starts=2)

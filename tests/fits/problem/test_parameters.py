@@ -138,6 +138,7 @@ def joint(*stacks: lj.Stack, shared: Sequence[str] = ("layers",)) -> Joint:
     return Joint(dict(zip(("one", "two"), map(problem, stacks), strict=True)), shared=shared)
 
 
+@pytest.mark.slow
 def test_a_power_law_is_recovered() -> None:
     """Coefficients of 6 / mm at 600 nm, with exponent 1.5."""
     mu_s = 6.0 * (np.array(WAVELENGTHS) / 600.0) ** -1.5

@@ -143,7 +143,8 @@ np.save(sys.argv[2], posterior.chain)
 """
 
 
-@pytest.mark.parametrize("times", [1, pytest.param(3, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("times", [1, 3])
 def test_killed_at_any_moment_it_ends_with_the_same_summary(result: Fit, posterior, tmp_path: Path, times: int) -> None:
     path, saved = tmp_path / "chain", tmp_path / "chain.npy"
     command = [sys.executable, "-c", SCRIPT, str(path), str(saved)]

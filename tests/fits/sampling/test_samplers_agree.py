@@ -1,7 +1,5 @@
 """emcee and NUTS sample one posterior: quantiles within a tenth of a deviation."""
 
-from typing import get_args
-
 import numpy as np
 import pytest
 
@@ -43,7 +41,7 @@ def test_quantiles_of_nuts_are_those_of_emcee(plain: Posterior) -> None:
     assert np.max(np.abs(first - second) / kept[1].std(axis=0)) < 0.1
 
 
-@pytest.mark.parametrize("sampler", get_args(Sampler))
+@pytest.mark.parametrize("sampler", ["emcee", pytest.param("nuts", marks=pytest.mark.slow)])
 def test_one_parameter(sampler: Sampler) -> None:
     fitted = fit({"a": 1.0, "b": Free(0.1, -1.0, 3.0)}, line_data(), transport=line, starts=2)
     x = design(COUNT)[:, 1]

@@ -180,14 +180,12 @@ COSINE, ALPHA, IOR = (
 )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("function", "arguments"),
     [
         (both_kinds, (COSINE, ALPHA, IOR)),
-        pytest.param(
-            *(lambda c, a, n, k: conductor_energy(c, a, n, k, True), (COSINE, ALPHA, IOR, 2.0 + 0.0 * IOR)),
-            marks=pytest.mark.slow,
-        ),
+        (lambda c, a, n, k: conductor_energy(c, a, n, k, True), (COSINE, ALPHA, IOR, 2.0 + 0.0 * IOR)),
         (retained, (COSINE, ALPHA, 0.6 * IOR)),
     ],
     ids=["interfaces", "metals", "retained"],

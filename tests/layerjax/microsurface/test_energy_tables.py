@@ -101,7 +101,8 @@ def test_cubics_are_found_again() -> None:
     np.testing.assert_allclose(found, (1.0 + places[0] ** 3) * (2.0 - places[1] ** 2), rtol=1e-10)
 
 
-@pytest.mark.parametrize("dtype", [jnp.float32, pytest.param(jnp.float64, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
 def test_ends_of_the_box(dtype) -> None:
     """Finite, in [0, 1], and with finite derivatives of both modes, everywhere."""
     axes = np.meshgrid([1e-6, 1e-3, 0.3, 1.0], [1e-4, 0.1, 1.0], [0.25, 1.0 - 1e-6, 1.0, 1.0 + 1e-6, 4.0])

@@ -39,7 +39,8 @@ def test_a_kind_by_its_number_is_the_phase_function_itself():
         np.testing.assert_array_equal(numbered.kernel(wi, wo, None), phase.kernel(wi, wo, None))
 
 
-@pytest.mark.parametrize("media", [1, pytest.param(2, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("media", [1, 2])
 def test_the_lobes_that_are_trained_are_those_of_the_transport(media):
     samples, net = drawn(media), network(media, jax.random.key(4))
     net = jax.tree.map(lambda leaf: 3.0 * leaf if eqx.is_inexact_array(leaf) else leaf, net)
@@ -75,6 +76,7 @@ def test_samples_lie_where_they_should():
     np.testing.assert_allclose(np.abs(samples.wo[..., 2]).mean(), 2 / 3, atol=5e-3)
 
 
+@pytest.mark.slow
 def test_a_shard_is_made_once_and_always_the_same(tmp_path, monkeypatch):
     monkeypatch.setattr(data, "SHARD", 2)
     monkeypatch.setattr(data, "TILTED", 0.0)  # Fourier modes: quick

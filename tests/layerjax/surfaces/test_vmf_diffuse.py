@@ -215,6 +215,7 @@ def test_weights_of_samples_are_bounded():
     assert (weight > 0)[(parameters["albedo"] > 0) & (wi[:, 2] > 1e-3)].mean() > 0.95
 
 
+@pytest.mark.slow
 def test_samples_follow_their_density():
     stack, wi = alone(0.9, 0.6), lj.direction(1.2, 0.4)
     wo, _, weight = lj.sample(stack, jnp.broadcast_to(wi, (DRAWS, 3)), jax.random.key(7))

@@ -71,6 +71,7 @@ STATED = 5e-3
 """Five times the error that resolutions are chosen for: these are ends of the box."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("ior", "alpha"), [(3.027, 0.00137), (2.0, 0.002), (1.5, 0.00137)])
 def test_a_smooth_varnish_over_white_reflects_all(ior, alpha):
     np.testing.assert_allclose(reflected_by_varnish(ior, alpha, "auto"), 1.0, atol=STATED)
@@ -87,6 +88,7 @@ def reflected_by_varnish(ior, alpha, transport):
     return lj.albedo(lj.Stack([lj.Interface(ior, alpha)], lj.Lambertian(1.0)), lj.direction(angles, 0.0), transport)[0]
 
 
+@pytest.mark.slow
 def test_values_under_a_smooth_varnish_are_those_of_a_mirror_of_it():
     """In closed form, by Snell's and Fresnel's laws alone: f = T(i) T(o) rho / (pi n^2 (1 - rho R))."""
     ior, albedo = 2.0, 0.7
@@ -109,9 +111,8 @@ def passed(cosine, ior):
     return 1.0 - 0.5 * (s**2 + p**2)
 
 
-@pytest.mark.parametrize(
-    "transport", ["auto", pytest.param(lj.Statistical(), marks=pytest.mark.slow)], ids=["auto", "Statistical"]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("transport", ["auto", lj.Statistical()], ids=["auto", "Statistical"])
 def test_no_value_is_negative(transport):
     """Also where the index steps down, and little passes beyond the critical angle."""
     generator = np.random.default_rng(5)

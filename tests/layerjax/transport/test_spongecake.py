@@ -58,13 +58,10 @@ def test_reciprocal_positive_and_by_sides(name):
         np.testing.assert_allclose(found, np.where(chosen[:, None], values, 0.0), rtol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name",
-    [
-        "fibers",
-        "fibers over haze",
-        *(pytest.param(name, marks=pytest.mark.slow) for name in ("flakes", "haze", "flakes over fibers")),
-    ],
+    ["fibers", "fibers over haze", "flakes", "haze", "flakes over fibers"],
 )
 def test_upside_down_and_lit_from_below_is_the_same(name):
     def turned(medium):
@@ -192,15 +189,16 @@ BOXES["fibers over haze"] = lambda p: [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "dtype"),
     [
         ("flakes", jnp.float32),
-        pytest.param("haze", jnp.float64, marks=pytest.mark.slow),
-        pytest.param("fibers over haze", jnp.float32, marks=pytest.mark.slow),
-        pytest.param("flakes", jnp.float64, marks=pytest.mark.slow),
-        pytest.param("haze", jnp.float32, marks=pytest.mark.slow),
-        pytest.param("fibers over haze", jnp.float64, marks=pytest.mark.slow),
+        ("haze", jnp.float64),
+        ("fibers over haze", jnp.float32),
+        ("flakes", jnp.float64),
+        ("haze", jnp.float32),
+        ("fibers over haze", jnp.float64),
     ],
 )
 def test_finite_over_the_box(name, dtype):
@@ -272,6 +270,7 @@ def test_costs_one_more_lobe_and_a_constant(name, side):
     assert operations(CAKE) < 3.4 * operations(FIRST)
 
 
+@pytest.mark.slow
 def test_albedo_of_upright_fibers_at_normal_incidence_in_float32():
     """Whatever alpha rounds to, nodes find a frame around the normal; 1e-3 is the error of the rule at 16 nodes."""
     wi, alphas = jnp.asarray([0.0, 0.0, 1.0], jnp.float32), jnp.linspace(0.2, 0.9, 100, dtype=jnp.float32)

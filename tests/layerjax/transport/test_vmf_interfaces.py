@@ -61,6 +61,7 @@ def test_energies_of_a_conductor():
             assert abs(energy[index, 0] - mean) < 4 * error + 3e-4  # the metal keeps 2e-4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("kappa", "theta"), [(0.05, 0.7), (3.0, 0.7), (3.0, 1.5), (60.0, 1.5)])
 def test_a_conductor_is_sampled_as_it_says(kappa, theta):
     stack, wi = lj.Stack([], metal(kappa)), lj.direction(theta, 0.4)
@@ -114,13 +115,14 @@ def test_reciprocity():
     np.testing.assert_array_less((np.abs(forth - back) - rtol * forth)[keep], 1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("dtype", "what"),
     [
         (np.float32, "values"),
-        pytest.param(np.float64, "values", marks=pytest.mark.slow),
-        pytest.param(np.float32, "draws", marks=pytest.mark.slow),
-        pytest.param(np.float64, "draws", marks=pytest.mark.slow),
+        (np.float64, "values"),
+        (np.float32, "draws"),
+        (np.float64, "draws"),
     ],
 )
 def test_values_and_gradients_are_finite(dtype, what):
@@ -152,6 +154,7 @@ def test_values_and_gradients_are_finite(dtype, what):
     assert (values[wide, 0] > 0).mean() > 0.6  # 0 where the index is 1
 
 
+@pytest.mark.slow
 def test_gradients_of_a_conductor_agree_with_differences():
     wi, wo = lj.direction(0.7, 0.2), lj.direction(0.5, 2.9)
 

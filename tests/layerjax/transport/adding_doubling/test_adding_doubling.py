@@ -53,6 +53,7 @@ def test_isotropic_slab_against_milne(thickness, cosine, reflected, transmitted)
     np.testing.assert_allclose(np.ravel(found), [reflected, transmitted], atol=2e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("layers", "reflected", "transmitted"),
     [
@@ -108,8 +109,8 @@ STACKS = {
 }
 
 
-SLOW = ("flakes with Fresnel on paint", "coated metal", "rough glass")
-"""The others hold one medium in modes and two in ordinates; interfaces meet the walk in `test_ballistic`."""
+SLOW = ("flakes with Fresnel on paint", "coated metal", "rough glass", "fibers over tilted flakes")
+"""The others hold one medium in modes."""
 
 
 @pytest.fixture(
@@ -164,6 +165,7 @@ def test_first_order_of_media_is_single_scattering():
     np.testing.assert_allclose(first, lj.evaluate(stack, wi, wo, lj.SingleScattering()), rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_along_the_normal_there_is_one_value():
     """Of fibers in the plane too, however the normal is approached; by the walk within 4 errors and 1 %."""
     stack = Stack([Medium(2.0, 0.95, FIBERS)])
@@ -183,6 +185,7 @@ def test_light_sent_straight_back_is_a_matter_of_two_streams():
     np.testing.assert_allclose(reflected, 0.1 / 1.1, rtol=5e-3)
 
 
+@pytest.mark.slow
 def test_only_stacks_with_an_axis_pay_for_ordinates():
     transport = lj.AddingDoubling(nodes=6, modes=4, ordinates=(4, 4))
     assert lj.prepare(STACKS["haze"], transport).state.tables.azimuths is None
@@ -191,6 +194,7 @@ def test_only_stacks_with_an_axis_pay_for_ordinates():
     assert lj.prepare(upright, transport).state.tables.azimuths is None
 
 
+@pytest.mark.slow
 def test_the_error_estimate_covers_the_error():
     stack = STACKS["haze"]
     wi, wo = directions(60, seed=8), directions(60, seed=9)
@@ -224,6 +228,7 @@ def test_errors_are_told_by_other_resolutions(nodes, compared):
     assert [(one.nodes, one.modes) for one in found] == compared
 
 
+@pytest.mark.slow
 def test_a_tolerance_is_not_reached_by_what_shines_beside(monkeypatch):
     """Next to a peak that is known in closed form any error of the rest is small: that counts by itself."""
     monkeypatch.setattr(

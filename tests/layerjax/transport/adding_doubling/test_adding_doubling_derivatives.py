@@ -47,7 +47,7 @@ def extreme_stack(kind, generator):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("mode", [jax.grad, pytest.param(jax.jacfwd, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("mode", [jax.grad, jax.jacfwd])
 def test_derivatives_of_many_stacks_side_by_side(mode):
     """Of a batch as a whole, for what the operators of a layer depend on: its index and its phase function."""
 
@@ -62,6 +62,7 @@ def test_derivatives_of_many_stacks_side_by_side(mode):
     np.testing.assert_allclose(together, (values(x + step) - values(x - step)) / (2.0 * step), rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_elements_are_differentiated_by_directions_too():
     """By the numbers that they are made of and by what they are asked for, forward and backward."""
 

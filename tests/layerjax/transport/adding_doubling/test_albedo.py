@@ -77,6 +77,7 @@ def check(alpha, base, dtype, degrees=DEGREES):
             np.testing.assert_allclose(energies[:, 0], truth, rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_albedo_is_the_integral_of_evaluate():
     check(0.003, "none", np.float64, (0.0, 75.0))
 
@@ -155,7 +156,8 @@ def mirrors(cosine, ior, metal):
     return coat + (1.0 - coat) ** 2 * base / (1.0 - coat * base)
 
 
-@pytest.mark.parametrize("alpha", [1e-4, pytest.param(1e-3, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("alpha", [1e-4, 1e-3])
 def test_albedo_of_a_coated_mirror_up_to_grazing_light(alpha):
     """A tenth had been lost at 80 degrees: a node next to the critical angle sent light past it. Without a warning."""
     theta = np.radians([0.0, 40.0, 60.0, 75.0, 80.0])

@@ -32,6 +32,7 @@ SLABS = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("numbers", SLABS)
 def test_agrees_with_the_walk(numbers):
     """4 standard errors, and for the solver at 6 nodes 1e-3 of the values and of a tenth of the largest."""
@@ -61,7 +62,7 @@ def test_is_the_same_beside_tables(above):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("reverse", [False, pytest.param(True, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("reverse", [False, True])
 def test_pairs_on_one_side_are_zero_and_change_no_others(reverse):
     """Whatever they stand among, values and derivatives of the others stay; without any that cross there are zeros.
     Derivatives are those of differences."""

@@ -10,6 +10,7 @@ import layerjax as lj
 SOLVER = lj.AddingDoubling(nodes=24, modes=1, facet_multiple_scattering=True)
 
 
+@pytest.mark.slow
 def test_energy_from_the_denser_side():
     """Index 2, roughness 0.3: nothing is lost, at the critical angle (30 degrees) neither."""
     angle = np.radians([0.0, 10.0, 29.9, 30.0, 30.1, 35.0, 60.0, 85.0])
@@ -18,6 +19,7 @@ def test_energy_from_the_denser_side():
     np.testing.assert_allclose(reflected + transmitted, 1.0, atol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("ior", "alpha"), [(1.5, 0.1), (1.5, 0.6)])
 def test_what_crosses_is_what_the_walk_counts(ior, alpha):
     """4 standard errors, and 2e-3 of the energies that decide which side the light ends on."""
@@ -39,7 +41,7 @@ ENDS = {
 """Interfaces (index, alpha) and media of depth 1 with this g, and by how much lossless energy is off at most."""
 
 
-SLOW = ("hardly there, peaked back, steps down", "hazy varnish")
+SLOW = ("hardly there, peaked back, steps down", "hazy varnish", "steps down, rough")
 
 
 @pytest.mark.parametrize("name", [pytest.param(name, marks=[pytest.mark.slow] * (name in SLOW)) for name in ENDS])

@@ -106,6 +106,7 @@ def test_energies(ratio, alpha):
     np.testing.assert_array_less(np.max(np.abs(found - expected), axis=1), slack)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("alpha", [slow(1e-4), slow(0.05), slow(0.1), 0.3, slow(0.5), slow(1.0), slow(15.0)])
 @pytest.mark.parametrize("ratio", [0.7, *map(slow, (0.95, 1.0, 1.5, 2.5))])
 def test_energies_of_vmf_normals(ratio, alpha):
@@ -169,6 +170,7 @@ def test_energies_beyond_the_critical_angle_are_smooth_in_the_index():
         np.testing.assert_allclose(found, (4 * narrow - wide) / 3, rtol=0, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_derivatives_are_finite_and_those_of_the_values():
     slopes = jax.jit(jax.jacfwd(energies, (0, 1, 2)))
     for ratio in (0.25, 1.0 - 1e-7, 1.0, 1.5):

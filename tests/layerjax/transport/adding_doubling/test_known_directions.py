@@ -30,9 +30,8 @@ def pairs(stack):
     return np.asarray(lj.direction(i, 0.4 + 0.0 * i)), np.asarray(lj.direction(o, phi))
 
 
-@pytest.mark.parametrize(
-    "name", ["paint", *(pytest.param(name, marks=pytest.mark.slow) for name in ("below 1", "metal", "vmf"))]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["paint", "below 1", "metal", "vmf"])
 def test_agrees_with_tables_of_a_finer_grid(name):
     stack = STACKS[name]
     wi, wo = pairs(stack)
@@ -144,9 +143,10 @@ def vary(x):
     return lj.Stack([lj.Interface(x[0], x[1]), medium], lj.Lambertian(x[5]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("dtype", "reverse"),
-    [(np.float64, False), *(pytest.param(dtype, True, marks=pytest.mark.slow) for dtype in (np.float64, np.float32))],
+    [(np.float64, False), (np.float64, True), (np.float32, True)],
 )
 def test_derivatives_of_all_parameters(dtype, reverse):
     """Forward and reverse, against differences; 2e-3 in single precision, where doubling replaces eigenvectors."""
@@ -174,6 +174,7 @@ def test_derivatives_of_all_parameters(dtype, reverse):
             np.testing.assert_allclose(jacobian[:, k], difference, atol=2e-6 * size)
 
 
+@pytest.mark.slow
 def test_values_are_smooth_in_every_parameter():
     """A thousandth of the box changes what is left of a straight line by less than a tenth of the error, 1e-3."""
     wi, wo = pairs(STACKS["paint"])

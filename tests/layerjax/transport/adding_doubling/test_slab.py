@@ -113,6 +113,7 @@ def test_nothing_is_lost_without_absorption():
         np.testing.assert_allclose(root @ (reflect + transmit)[0] / root, 1.0, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_gradients_are_finite_at_the_ends():
     p, q = equations(1.0, 0.0)
 
@@ -124,6 +125,7 @@ def test_gradients_are_finite_at_the_ends():
             assert np.isfinite(slope).all()
 
 
+@pytest.mark.slow
 def test_decomposed_together_as_on_a_gpu(monkeypatch):
     """Slabs of several media side by side, and their derivatives by all: to the rounding of eigenvalues."""
     modes = [equations(albedo, g, 1) for albedo, g in MEDIA]
@@ -160,6 +162,7 @@ def assert_close(one, other, atol):
         np.testing.assert_allclose(getattr(one, side).rest, getattr(other, side).rest, rtol=0, atol=atol)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("thickness", [1e-8, 1e-3, 1.0, 1e4])
 @pytest.mark.parametrize("phase", [lj.HenyeyGreenstein(-0.9), lj.HenyeyGreenstein(0.999), FIBERS])
 def test_eigenvectors_and_doublings_agree(phase, thickness):

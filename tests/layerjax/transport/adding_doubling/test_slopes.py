@@ -50,11 +50,6 @@ REVERSE = ("flakes", "haze on metal", "low coat on paint")
 """Whose gradients compile fast."""
 
 
-SHORT_ONES = ("flakes",)
-"""Whose programs do as well. Those of a hazy coat are compared with differences in `test_known_directions`, and light
-that passes a slab straight is in `test_ballistic`."""
-
-
 def build_of(kind):
     return OTHERS[kind][1] if kind in OTHERS else STRUCTURES[kind][1]
 
@@ -125,9 +120,8 @@ def wrong(kind, numbers, transport, known=True, reverse=True):
                 yield f"{k}: off by {off:.1e} of |f| at steps of {share:g}, at {numbers}"
 
 
-@pytest.mark.parametrize(
-    "kind", [pytest.param(kind, marks=[pytest.mark.slow] * (kind not in SHORT_ONES)) for kind in (*STRUCTURES, *OTHERS)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", [*STRUCTURES, *OTHERS])
 def test_slopes_are_those_of_differences(kind):
     found = list(wrong(kind, numbers_of(kind, 0), SHORT, reverse=kind in REVERSE))
     assert not found, "\n".join(found)

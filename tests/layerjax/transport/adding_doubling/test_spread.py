@@ -36,6 +36,7 @@ def test_nodes_go_to_nodes(region: int) -> None:
     assert not found[exists][:, ~exists].any()
 
 
+@pytest.mark.slow
 def test_weights_move_smoothly_over_edges() -> None:
     """Third differences fall with the third power of the step, as those of a jump or of a root do not."""
     for edge in (1.0, 1.69):

@@ -26,6 +26,7 @@ def values_of(kind, transport="auto"):
     return lambda numbers: lj.evaluate(STRUCTURES[kind][1](numbers), WI, WO, transport)[:, 0]
 
 
+@pytest.mark.slow
 def test_a_coated_metal_under_jit():
     """Values of a walk, with three of its standard errors at most."""
 

@@ -226,6 +226,7 @@ def samples_weights_and_albedo(name, transport, theta):
     assert (transmitted > 0).all() == (STACKS[name].base is None)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "transport", "theta"), CASES)
 def test_samples_weights_and_albedo(name, transport, theta):
     samples_weights_and_albedo(name, transport, theta)
@@ -243,6 +244,7 @@ def test_where_nothing_is_all_draws_follow_the_cosine():
     assert not weight.any()
 
 
+@pytest.mark.slow
 def test_what_is_not_there_costs_nothing():
     wi, wo = lj.direction(jnp.linspace(0.1, 1.4, 50), 0.0), lj.direction(jnp.linspace(0.2, 1.3, 50), 2.0)
 

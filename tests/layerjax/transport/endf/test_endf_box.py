@@ -76,6 +76,7 @@ def values_and_gradients_are_finite(name, transport, dtype, mode):
     assert (value[both] > 0).mean() > 0.95  # finite because it is computed, not because it is 0
 
 
+@pytest.mark.slow
 def test_values_and_gradients_are_finite():
     values_and_gradients_are_finite("coat", RECIPROCAL, np.float32, "reverse")
 

@@ -163,6 +163,7 @@ def concentrations(ior, theta, above, below):
     return cosine, inside, coats, slabs
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
 def test_concentrations_of_chains(dtype):
     theta, above, below = (np.array(values, dtype) for values in zip(*CHAINS, strict=True))

@@ -23,6 +23,7 @@ def agree(found, error, expected, slack=0.0):
     np.testing.assert_array_less(np.abs(np.asarray(found) - expected), 4 * np.asarray(error) + slack)
 
 
+@pytest.mark.slow
 def test_milne_slabs():
     # isotropic and lossless, from the Milne equation
     def energies(tau, mu):
@@ -44,6 +45,7 @@ def test_milne_slabs():
             agree(single, single_error[:, 0, 0], [0.1420154, 0.1061729])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("layers", "up", "down"),
     [
@@ -117,16 +119,17 @@ COATED = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "facet_multiple_scattering", "count"),
     [
         ("two media", False, 400),
-        pytest.param("paint", False, 400, marks=pytest.mark.slow),
-        pytest.param("paint", True, 400, marks=pytest.mark.slow),
-        pytest.param("haze on varnish", False, 400, marks=pytest.mark.slow),
-        pytest.param("plate", True, 400, marks=pytest.mark.slow),
-        pytest.param("two coats on metal", False, 400, marks=pytest.mark.slow),
-        pytest.param("two coats on metal", True, 400, marks=pytest.mark.slow),
+        ("paint", False, 400),
+        ("paint", True, 400),
+        ("haze on varnish", False, 400),
+        ("plate", True, 400),
+        ("two coats on metal", False, 400),
+        ("two coats on metal", True, 400),
     ],
 )
 def test_bins_hold_the_integral_of_the_values(name, facet_multiple_scattering, count):
@@ -145,6 +148,7 @@ def test_bins_hold_the_integral_of_the_values(name, facet_multiple_scattering, c
         agree(seen.energy, np.hypot(seen.energy_error, error), mean, slack=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ior", [1.5, 1 / 1.5, 3.0])
 def test_energy_of_one_interface(ior):
     alpha = jnp.asarray(0.5)

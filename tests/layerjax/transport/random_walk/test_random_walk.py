@@ -84,23 +84,15 @@ def test_one_interface(ior):
     np.testing.assert_allclose(back, passed / ior**2, rtol=1e-9)  # f / ior_o^2 is reciprocal
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("stack", "options"),
     [
         (lj.Stack([haze(0.7, 2.0, 0.95), flakes("fiber", 0.3, (1.0, 0.0, 0.0), 0.5, 0.9)]), {}),
         (lj.Stack(COLORED, lj.Lambertian([0.5, 0.2, 0.1])), {}),
-        pytest.param(
-            *(lj.Stack([lj.Interface(1.5, 0.4)], lj.Conductor(0.2, 3.9, 0.4)), {"facet_multiple_scattering": True}),
-            marks=pytest.mark.slow,
-        ),
-        pytest.param(
-            *(lj.Stack([lj.Interface(1.5, 0.2), haze(0.5, 1.0, 0.9)], lj.Lambertian(0.8)), {}), marks=pytest.mark.slow
-        ),
-        pytest.param(
-            lj.Stack([lj.Interface(1.5, 0.2), haze(0.5, 1.0, 0.9)], lj.Conductor(0.2, 3.9, 0.01)),
-            {},
-            marks=pytest.mark.slow,
-        ),
+        (lj.Stack([lj.Interface(1.5, 0.4)], lj.Conductor(0.2, 3.9, 0.4)), {"facet_multiple_scattering": True}),
+        (lj.Stack([lj.Interface(1.5, 0.2), haze(0.5, 1.0, 0.9)], lj.Lambertian(0.8)), {}),
+        (lj.Stack([lj.Interface(1.5, 0.2), haze(0.5, 1.0, 0.9)], lj.Conductor(0.2, 3.9, 0.01)), {}),
     ],
 )
 def test_standard_errors_are_honest(stack, options):
@@ -257,6 +249,7 @@ def test_sides():
     assert lj.evaluate(open_stack, flat, wo, walk, key=KEY).tolist() == [[0.0]] * 4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("dtype", "stack", "facet_multiple_scattering"),
     [
@@ -280,11 +273,12 @@ def test_the_edges_of_the_box_are_finite(dtype, stack, facet_multiple_scattering
         assert (values >= 0).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "stack",
     [
         lj.Stack([haze(0.5, 1.0, 0.9)]),
-        pytest.param(lj.Stack([lj.Interface(1.5, 0.4)], lj.Lambertian(0.5)), marks=pytest.mark.slow),
+        lj.Stack([lj.Interface(1.5, 0.4)], lj.Lambertian(0.5)),
     ],
 )
 def test_samples_weigh_the_albedo(stack):

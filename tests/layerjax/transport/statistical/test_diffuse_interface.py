@@ -122,13 +122,14 @@ def absorbed(energy, path, tau):
     return left, np.sqrt(left * (1 - left) / PATHS) + 1e-4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("n", "alpha"),
     [
         (1.5, 0.6),
         (0.5, 0.9),
-        pytest.param(1 / 1.5, 0.3, marks=pytest.mark.slow),
-        pytest.param(2.5, 0.2, marks=pytest.mark.slow),
+        (1 / 1.5, 0.3),
+        (2.5, 0.2),
     ],
 )
 def test_rough_coats_against_the_walk(n, alpha):
@@ -225,7 +226,7 @@ def test_nothing_is_lost_without_absorption():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("dtype", [jnp.float32, pytest.param(jnp.float64, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
 def test_finite_over_the_box(dtype):
     axes = [1e-6, 0.3, np.sqrt(1 - 0.7**2), 1.0], [1e-4, 0.1, 1.0], [0.25, 0.7, 0.999, 1.0, 1.5, 4.0], [0.0, 1e-3, 1.0]
     points = jnp.asarray(np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 4), dtype)

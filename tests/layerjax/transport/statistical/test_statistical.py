@@ -77,6 +77,7 @@ def test_albedo_is_as_near_to_the_walk_as_the_model_can_be(name):
     assert np.all(np.abs(found) <= np.array(errors) + 0.5)  # 0.5 %: energies of rough faces, and rounding of the table
 
 
+@pytest.mark.slow
 def test_haze_behind_an_index_spreads_transmitted_light_alike_from_either_side():
     """A collision adds the variance of its phase function in the medium where it happens."""
     stack, cosine = lj.Stack([lj.Interface(1.5, 1e-4), lj.Medium(0.5, 1.0, lj.HenyeyGreenstein(0.9))]), jnp.ones(())
@@ -92,7 +93,9 @@ def test_albedo_of_a_coated_diffuse_base():
     np.testing.assert_allclose(reflected[:, 0], [0.79484, 0.80497], atol=1e-3)
 
 
-@pytest.mark.parametrize("stack", [COAT, SLAB, DIFFUSE], ids=["coat", "slab", "diffuse"])
+@pytest.mark.parametrize(
+    "stack", [COAT, pytest.param(SLAB, marks=pytest.mark.slow), DIFFUSE], ids=["coat", "slab", "diffuse"]
+)
 def test_symmetric_model_is_reciprocal(stack):
     rng = np.random.default_rng(1)
     w = rng.normal(size=(2, 200, 3))
@@ -123,14 +126,15 @@ def test_what_nothing_meets_is_not_in_the_albedo():
     np.testing.assert_allclose(transmitted[:, 0], np.exp(-0.2 * depth) - np.exp(-depth), rtol=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("stack", "transport", "theta"),
     [
-        pytest.param(COAT, FORWARD, 0.5, marks=pytest.mark.slow),
+        (COAT, FORWARD, 0.5),
         (DIFFUSE, FORWARD, 1.2),
-        pytest.param(SLAB, FORWARD, 0.5, marks=pytest.mark.slow),
-        pytest.param(SLAB, FORWARD, 2.4, marks=pytest.mark.slow),
-        pytest.param(SLAB, SYMMETRIC, 2.4, marks=pytest.mark.slow),
+        (SLAB, FORWARD, 0.5),
+        (SLAB, FORWARD, 2.4),
+        (SLAB, SYMMETRIC, 2.4),
     ],
 )
 def test_samples_follow_their_density_and_have_the_albedo_as_mean_weight(stack, transport, theta):
@@ -151,13 +155,7 @@ def test_samples_follow_their_density_and_have_the_albedo_as_mean_weight(stack, 
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("ior", "absorbing"),
-    [
-        (1.5, 0.4),
-        *(
-            pytest.param(*case, marks=pytest.mark.slow)
-            for case in [(1.33, 0.0), (1.33, 0.4), (1.5, 0.0), (1 / 1.5, 0.0), (1 / 1.5, 0.4)]
-        ),
-    ],
+    [(1.5, 0.4), (1.33, 0.0), (1.33, 0.4), (1.5, 0.0), (1 / 1.5, 0.0), (1 / 1.5, 0.4)],
 )
 def test_closed_form_of_a_coated_diffuse_base(ior, absorbing):
     """Against the walk, away from the mirror lobe: 4 standard errors and 0.3 %."""

@@ -119,6 +119,7 @@ def test_adding_is_the_sum_over_paths(seed: int) -> None:
     np.testing.assert_allclose(found, paths(elements), rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_scattering_orders_sum_to_the_whole() -> None:
     """Whatever the orders are, their sums follow the same adding; and the first two are those of a power series."""
     elements = random_elements(4, 3, orders=3)

@@ -63,7 +63,8 @@ def test_values():
     assert jnp.all(f >= 0)
 
 
-@pytest.mark.parametrize("dtype", [jnp.float32, pytest.param(jnp.float64, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
 def test_energies_of_smooth_interfaces(dtype):
     """Known to be smooth: Fresnel's formulas, at equal indices and at critical angles too."""
     cosine, alpha = jnp.asarray([1.0, 0.8, 0.6, 1e-3, 1e-6], dtype), jnp.asarray(1e-4, dtype)

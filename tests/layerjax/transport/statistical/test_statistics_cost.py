@@ -29,6 +29,7 @@ def test_media():
     assert program([COAT, lj.Medium(0.0, 0.9)]) == program([COAT])
 
 
+@pytest.mark.slow
 def test_interfaces():
     bare, one, two = (operations(layers) for layers in ([], [COAT], [COAT, lj.Interface(1.8, 0.1)]))
     assert bare < one < two
@@ -36,6 +37,7 @@ def test_interfaces():
     assert program([COAT, lj.Interface(1.5, 0.1)]) == program([COAT])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("multiple", [False, True])
 def test_smooth_interfaces(multiple):
     """Fresnel's formulas in place of a quadrature over facets."""
@@ -66,6 +68,7 @@ def test_bases():
     assert operations([], DIFFUSE) < 12 < operations([], METAL) < operations([COAT])
 
 
+@pytest.mark.slow
 def test_one_side():
     stack = lj.Stack([COAT])
     everything, reflection = (
@@ -75,6 +78,7 @@ def test_one_side():
     assert reflection < everything
 
 
+@pytest.mark.slow
 def test_channels():
     one, three = operations([COAT, lj.Medium(0.7, 0.0)]), operations([COAT, lj.Medium([0.1, 0.7, 2.0], 0.0)])
     assert one < three < 1.5 * one

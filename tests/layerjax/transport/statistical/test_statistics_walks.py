@@ -71,9 +71,8 @@ def count(stack, multiple=True, seed=1):
     ]
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[pytest.mark.slow] * name.startswith("2/.5")) for name in WALKS]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", WALKS)
 def test_walk_gives_published_energies(name):
     """4 standard errors of both walks together."""
     stack, (albedo, error), below, _ = WALKS[name]
@@ -84,6 +83,7 @@ def test_walk_gives_published_energies(name):
         np.testing.assert_array_less(np.abs(found - once - below[0]), 4 * noise)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", WALKS)
 def test_statistics_are_as_near_as_they_can_be(name):
     """Every lobe: that of the coat to 2e-3 (energies and walk), those from below to what the model errs by + 0.5 %."""

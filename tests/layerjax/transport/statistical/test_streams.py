@@ -35,17 +35,14 @@ STRUCTURES = {
     "haze on haze": [HAZE, COAT, HAZE],
     "thinner than air": [lj.Interface(0.8, 0.1), HAZE],
 }
-OFTEN = ("haze on a coat",)
-"""The others are slow tests."""
 
 
 def made(stack: Stack) -> HazyBase | StreamedBase:
     return make_hazy(stack) if is_hazy(stack) else make_streamed(stack)
 
 
-@pytest.mark.parametrize(
-    "name", [name if name in OFTEN else pytest.param(name, marks=pytest.mark.slow) for name in STRUCTURES]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", STRUCTURES)
 def test_light_from_the_base_is_as_solved(name: str) -> None:
     stack = simplify(lj.Stack(STRUCTURES[name], BASE))
     assert is_hazy(stack) is isinstance(stack.layers[0], lj.Medium)
@@ -103,7 +100,7 @@ def test_nothing_is_lost(layers) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("dtype", [jnp.float64, pytest.param(jnp.float32, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("dtype", [jnp.float64, jnp.float32])
 def test_derivatives_of_haze_on_top(dtype: jnp.dtype) -> None:
     """Finite at the ends, along grazing light too, and as differences say, which at ends look inward."""
 
@@ -163,6 +160,7 @@ def test_slabs_at_ends(dtype) -> None:
         np.testing.assert_allclose(whole, [streams.DIFFUSE] * 2, atol=lost)
 
 
+@pytest.mark.slow
 def test_derivatives_of_slabs_at_ends() -> None:
     @jax.jit
     def energy(thickness, albedo, g):
