@@ -19,7 +19,7 @@ from fits.optimise.fit import refit
 from fits.optimise.result import Fit
 from fits.prediction.evidence import Evidence, evidence_of, posterior_draws
 from fits.prediction.options import DEFAULT, ComparisonOptions
-from fits.prediction.predict import posterior_predictive
+from fits.prediction.predict import draws_to_resample, posterior_predictive
 from fits.problem.discrepancy import size
 from fits.problem.problem import Problem
 from fits.progress import Progress, given_progress, named
@@ -73,7 +73,6 @@ def cross_validate(
     seed: int = 0,
     options: ComparisonOptions | None = None,
     progress: Progress | None = None,
-    initial: Mixture | None = None,
 ) -> CrossValidation:
     """Fit again without each incidence, starting from the best values, and predict its measurements.
 
@@ -85,22 +84,29 @@ def cross_validate(
         seed: see `predict`.
         options: `min_incidences` and `scan_parts` decide what is held out together.
         progress: called with ("cross-validation", groups done, groups, name).
-        initial: approximation of the fit's posterior, from which those without a group are sought.
 
     Raises:
         ValueError: a fit of a named objective, data of a single group, or a joint fit or a part of one.
     """
     require_count("draws", draws, 2)
     require_seed(seed)
-    progress, options = given_progress(progress), options or DEFAULT
+    return _cross_validate(fit, draws, seed, options or DEFAULT, given_progress(progress))
+
+
+def _cross_validate(
+    fit: Fit, draws: int, seed: int, options: ComparisonOptions, progress: Progress, initial: Mixture | None = None
+) -> CrossValidation:
+    """initial: approximation of the fit's posterior, from which those without a group are sought."""
     groups, data = require_groups(fit, options), fit.problem.data.used()
     density, errors, converged = np.zeros(data.values.shape), np.zeros(len(groups)), True
     for number, (name, rows) in enumerate(groups.items()):
         progress("cross-validation", number, len(groups), name)
         rest = refit(without(fit.problem, np.isin(np.arange(len(data)), rows)), fit.vector, *other_minima(fit))
-        each, effective, error = np.empty((0, *data.values[rows].shape)), 0.0, math.inf
+        each, effective, error, approximation = np.empty((0, *data.values[rows].shape)), 0.0, math.inf, initial
         while not len(each) or (error > options.monte_carlo_error and len(each) < options.most_draws):
-            prediction = posterior_predictive(rest, data, draws=draws, seed=seed + len(each), initial=initial)
+            pool = draws_to_resample(rest, draws, np.random.RandomState(seed + len(each)), approximation)
+            approximation = pool.mixture
+            prediction = posterior_predictive(rest, data, draws=draws, seed=seed + len(each), pool=pool)
             each = np.concatenate([each, prediction.log_densities(data.values)[:, rows]])
             effective += prediction.effective_draws
             density[rows] = logsumexp(each, axis=0) - math.log(len(each))
@@ -185,7 +191,7 @@ def out_of_sample(
     """Cross-validation and evidence of a fit, both by draws of its posterior."""
     require_groups(fit, options)
     draws = posterior_draws(fit)
-    held_out = cross_validate(fit, options=options, progress=progress, initial=draws.mixture)
+    held_out = _cross_validate(fit, DRAWS, 0, options or DEFAULT, given_progress(progress), draws.mixture)
     return held_out, evidence_of(draws)
 
 

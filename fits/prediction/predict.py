@@ -29,7 +29,7 @@ from fits.problem.instrument import gain_unknown
 from fits.problem.model import Model
 from fits.problem.problem import polar_angles
 from fits.problem.simulate import require_visible
-from fits.sampling.importance import importance_draws
+from fits.sampling.importance import ImportanceDraws, importance_draws
 from fits.sampling.initial import normal_draws
 from fits.sampling.mixture import Mixture
 from fits.sampling.options import MAX_PARETO_K
@@ -275,9 +275,9 @@ def predict(
 
 
 def posterior_predictive(
-    fitted: Fit | Posterior, at: Geometry | Measurements, *, draws: int, seed: int, initial: Mixture | None = None
+    fitted: Fit | Posterior, at: Geometry | Measurements, *, draws: int, seed: int, pool: ImportanceDraws | None = None
 ) -> Prediction:
-    """`predict` for one fit; initial: an approximation of its posterior (see `importance_draws`), if there is one."""
+    """`predict` for one fit; pool: weighted draws of its posterior, if there are some."""
     fit = fitted.fit if isinstance(fitted, Posterior) else fitted
     fit.require_one("predict")
     if not fit.is_posterior:
@@ -305,10 +305,9 @@ def posterior_predictive(
         if fit.dataset is not None:  # the other data sets of a joint fit constrain it as well: in its covariance
             positions = normal_draws(fit, draws, random)
         else:
-            pool = max(MIN_PROPOSALS, 2 * draws)
-            weighted = importance_draws(fit, pool, random, max_pareto_k=MAX_PARETO_K, initial=initial)
-            positions, pareto_k = weighted.resample(random, draws), weighted.pareto_k
-            effective = _resampled_size(draws, weighted.effective_sample_size)
+            pool = pool or draws_to_resample(fit, draws, random)
+            positions, pareto_k = pool.resample(random, draws), pool.pareto_k
+            effective = _resampled_size(draws, pool.effective_sample_size)
         vectors = np.asarray(jax.vmap(problem.model.box.constrain)(jnp.asarray(positions)), float)
 
     # what the stack has there, the discrepancy, and noise
@@ -342,6 +341,13 @@ def posterior_predictive(
         effective_draws=effective,
         measurements=data if isinstance(at, Measurements) else None,
     )
+
+
+def draws_to_resample(
+    fit: Fit, draws: int, random: np.random.RandomState, initial: Mixture | None = None
+) -> ImportanceDraws:
+    """Weighted draws of a posterior, enough to take so many of; initial: see `importance_draws`."""
+    return importance_draws(fit, max(MIN_PROPOSALS, 2 * draws), random, max_pareto_k=MAX_PARETO_K, initial=initial)
 
 
 def _resampled_size(draws: int, pool: float) -> float:
