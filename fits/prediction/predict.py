@@ -7,7 +7,7 @@ mixture of these D distributions: Gaussian, or Student's t, of the BSDF or of it
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Protocol
 
@@ -158,6 +158,12 @@ class Prediction:
             raise ValueError("scores: a Geometry was predicted; predict Measurements to score them")
         return scores(self, self.measurements)
 
+    def _at(self, rows: NDArray[np.bool_]) -> "Prediction":
+        """The prediction at some of its pairs of directions, (M,)."""
+        names = ("values", "means", "scales", "softness", "discrepancy_sd")
+        by_pair = {name: one[..., rows, :] for name in names if (one := getattr(self, name)) is not None}
+        return replace(self, wi=self.wi[rows], wo=self.wo[rows], measurements=None, **by_pair)
+
     @property
     def reliable(self) -> bool:
         """Whether the draws represent the whole posterior; otherwise sample it by a chain."""
@@ -224,9 +230,9 @@ def scores(prediction: Prediction, measurements: Measurements, rows: NDArray[np.
     chosen = np.ones(len(used), bool) if rows is None else rows
     if not chosen.any():
         raise ValueError("scores: there is no measurement to score")
-    values, rank = used.values[chosen], prediction.cdf(used.values)[chosen]
-    magnitude = np.maximum(np.abs(values), np.finfo(float).tiny)
-    predicted = (prediction.median[chosen], prediction.latent.mean[chosen])
+    values, prediction = used.values[chosen], prediction._at(chosen)
+    rank, magnitude = prediction.cdf(values), np.maximum(np.abs(values), np.finfo(float).tiny)
+    predicted = (prediction.median, prediction.latent.mean)
     error, model_error = (np.abs(one - values) / magnitude for one in predicted)
     return Scores(
         count=values.size,
@@ -234,7 +240,7 @@ def scores(prediction: Prediction, measurements: Measurements, rows: NDArray[np.
         p95_error=float(np.quantile(error, 0.95)),
         model_error=float(np.median(model_error)),
         coverage={level: float(np.mean(np.abs(2.0 * rank - 1.0) < level)) for level in COVERAGES},
-        elpd=float(np.mean(prediction.log_density(used.values)[chosen])),
+        elpd=float(np.mean(prediction.log_density(values))),
     )
 
 
