@@ -97,7 +97,7 @@ def test_jacobians_forward_and_backward_are_those_within_jit(ruled):
     same(value, values(at), 1e-12)
 
 
-@pytest.mark.parametrize("number", ["alpha", "thickness"])
+@pytest.mark.parametrize("number", [pytest.param("alpha", marks=pytest.mark.slow), "thickness"])
 def test_a_gradient_by_one_number_agrees_with_differences(number):
     """Of the others all is known: that the resolution, and the order of indices, are chosen by them does not change."""
 

@@ -275,6 +275,7 @@ def test_values_gradients_and_weights_are_finite(name, dtype, mode):
     assert (value[both] > 0).mean() > 0.95  # finite because it is computed, not because it is 0
 
 
+@pytest.mark.slow
 def test_tangent_and_unnormalised_directions_give_no_nan():
     odd = jnp.array([[1.0, 0, 0], [0, 0, 0], [2, 2, 2], [1, 0, 1e-30], [0, 0, 1e-8], [0, 0, -3], [1e-20, 0, 1e-20]])
     for dtype in (jnp.float32, jnp.float64):

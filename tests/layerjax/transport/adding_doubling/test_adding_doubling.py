@@ -77,7 +77,7 @@ def test_flakes_against_published_walks(layers, reflected, transmitted):
         Medium(1e4, phase=HenyeyGreenstein(0.5)),
         Medium(0.1, phase=lj.SGGX("surface", 0.05)),
         Medium(2.0, phase=FIBERS),
-        Medium(2.0, phase=FLAKES),
+        pytest.param(Medium(2.0, phase=FLAKES), marks=pytest.mark.slow),
     ],
     ids=["haze", "thick", "thin mirrors", "fibers in the plane", "tilted flakes"],
 )

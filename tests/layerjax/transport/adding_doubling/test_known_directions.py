@@ -85,6 +85,7 @@ def test_directions_that_others_are_known_of_are_refused():
         evaluate_known(STACKS["paint"], wi, wo, SOLVER, known=known_directions(wi[:2], wo[:2]))
 
 
+@pytest.mark.slow
 def test_shapes_and_directions_without_light():
     stack = lj.Stack([lj.Interface(1.5, 0.7)])
     wi, wo = (w[::5].copy() for w in pairs(stack))

@@ -111,7 +111,7 @@ def examples(beam, facets, cosine, ior):
     return (reflected, refracted), extended, exact
 
 
-@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+@pytest.mark.parametrize("dtype", [np.float64, pytest.param(np.float32, marks=pytest.mark.slow)])
 def test_the_examples_of_the_paper(dtype):
     given = (jnp.asarray(value, dtype) for value in (BEAMS, FACETS, COSINES, IOR))
     (reflected, refracted), (as_facets, as_refracting), (moment, trace) = examples(*given)

@@ -185,6 +185,7 @@ def test_closed_form_under_two_interfaces_and_haze():
     np.testing.assert_allclose(found, truth, rtol=3e-3)
 
 
+@pytest.mark.slow
 def test_lobe_of_a_diffuse_base_has_the_energy_of_the_closed_form():
     wi = LIGHT[:3]
     exact, _ = lj.albedo(DIFFUSE, wi, FORWARD)
