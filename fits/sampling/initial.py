@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from numpy.typing import NDArray
-from scipy.special import logit, logsumexp
+from scipy.special import logit
 
 from fits.data.geometry import Floats
 from fits.optimise.multi_start import least_squares_descent, unit_of
@@ -46,7 +46,7 @@ def initial_mixture(fit: Fit, share: int, smallest_mode: float = SamplerOptions.
         if near or end.cost >= fit.cost + LOWEST_MINIMUM:
             continue
         found.append(_about(problem, end.vector, uncertainty(problem, end.vector, end.cost).at_bound, share))
-    mass = np.array([logsumexp(one.log_weight) for one in found])
+    mass = np.concatenate([one.log_weight for one in found])
     kept = [one for one, its in zip(found, mass, strict=True) if its > np.max(mass) + np.log(smallest_mode)]
     return Mixture.of_modes(kept)
 
