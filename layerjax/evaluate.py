@@ -104,7 +104,7 @@ def evaluate_known(
     if shape:
         return _evaluate_map(stack, wi, wo, transport, side, key, shape)
     looked = cache(lambda: known_directions(wi, wo) if known is None else known)
-    if not isinstance(stack, Prepared) and not is_traced(wi, wo):
+    if not isinstance(stack, Prepared) and is_traced(stack) and not is_traced(wi, wo):
         values = math.prod(jnp.broadcast_shapes(wi.shape, wo.shape)[:-1]) * channel_count(stack)
         if few_parameters(stack, values):
             require_numbers(stack)

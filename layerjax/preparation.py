@@ -102,7 +102,6 @@ def prepared_at(stack: Stack | Prepared, transport: Any, dtype: jnp.dtype, known
 def prepared_for_energies(stack: Stack | Prepared, transport: Any, dtype: jnp.dtype) -> Prepared:
     """A stack, prepared or not, for its albedo along directions of this floating type."""
     if not isinstance(stack, Prepared):
-        require_numbers(stack)
         require_single(stack, "prepare")
         chosen, simplified = chosen_for(stack, transport, None)
         stack = Prepared(chosen.prepare_energies(simplified), chosen, channel_count(stack))
@@ -112,7 +111,6 @@ def prepared_for_energies(stack: Stack | Prepared, transport: Any, dtype: jnp.dt
 def prepare_at(stack: Stack, transport: Any, known: Known) -> Prepared:
     """`prepare` for values at directions of which this is known."""
     known = cache(known)
-    require_numbers(stack)
     require_single(stack, "prepare")
     chosen, simplified = chosen_for(stack, transport, known)
     return Prepared(chosen.prepare_for(simplified, known), chosen, channel_count(stack))

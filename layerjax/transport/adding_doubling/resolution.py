@@ -19,6 +19,7 @@ import jax
 import numpy as np
 
 from layerjax._known import known_values
+from layerjax.compiling import is_traced
 from layerjax.stack import Interface, Medium, Stack, TurbidMedium, is_known
 from layerjax.surfaces import Conductor
 
@@ -153,6 +154,8 @@ def shortage(stack: Stack, followed: bool) -> str | None:
 
 def is_guessed(stack: Stack, followed: bool) -> bool:
     """Whether a lobe has to be resolved of whose width nothing is known while tracing, as under ``jit``."""
+    if not is_traced(stack):
+        return False
     media = [layer for layer in stack.layers if not isinstance(layer, Interface) and not is_known(layer.albedo, 0.0)]
     # phase functions assume a g by themselves
     if any(known_values(leaf) is None for layer in media for leaf in jax.tree.leaves(layer.phase)):

@@ -365,6 +365,8 @@ class AddingDoubling(DeterministicTransport):
 
     def _resolution(self, stack: Stack, followed: bool) -> Resolution:
         """What is given, and for the rest what is chosen."""
+        if self.nodes and self.modes and self.ordinates:
+            return Resolution(self.nodes, self.modes, self.ordinates)
         by_stack = chosen(stack, followed)
         nodes = by_stack.nodes if self.nodes is None else self.nodes
         modes = by_stack.modes if self.nodes is None else modes_for(self.nodes)
