@@ -62,20 +62,14 @@ def _stack(tables: dict[str, Any]) -> str:
 
 
 def _call(table: dict[str, Any], indent: int, name: str = "") -> str:
-    """The code of a part of a stack file, in lines of at most COLUMNS characters."""
+    """The code of a part of a stack file, an argument a line where one line would be longer than COLUMNS."""
     keys = sorted(table.keys() - {"kind"}, key=lambda key: (key != "shape", list(table).index(key)))
     items = [(key, "" if key == "shape" else f"{key}=") for key in keys]
     words = [word + _value(table[key], indent + 4, word) for key, word in items]
     line = f"lj.{table['kind']}({', '.join(words)})"
     if "\n" not in line and indent + len(name) + len(line) < COLUMNS:
         return line
-    lines = [words[0]]
-    for word in words[1:]:
-        if "\n" in lines[-1] + word or indent + 4 + len(lines[-1]) + len(word) + 2 >= COLUMNS:
-            lines.append(word)
-        else:
-            lines[-1] += f", {word}"
-    body = "".join(f"{' ' * (indent + 4)}{line},\n" for line in lines)
+    body = "".join(f"{' ' * (indent + 4)}{word},\n" for word in words)
     return f"lj.{table['kind']}(\n{body}{' ' * indent})"
 
 

@@ -43,7 +43,13 @@ ENDINGS: dict[str, str] = {
 
 @dataclass(frozen=True)
 class ExportReport:
-    """A written file. notes: what it holds, how accurately, and what it omits, one sentence each."""
+    """A written file.
+
+    Attributes:
+        path: the file.
+        to: its format.
+        notes: what it holds, how accurately, and what it omits, one sentence each.
+    """
 
     path: Path
     to: To

@@ -102,17 +102,17 @@ class Prediction:
 
     @cached_property
     def latent(self) -> Summary:
-        """The stack alone, without the discrepancy."""
+        """Summary of the stack without model discrepancy."""
         return self._summary(self.values)
 
     @property
     def bsdf(self) -> Summary:
-        """The BSDF: the stack's value with the model discrepancy. This is the best estimate."""
+        """Summary of the BSDF, which is the stack with its model discrepancy (the best estimate)."""
         return self._summaries[0]
 
     @property
     def predictive(self) -> Summary:
-        """A new measurement: the BSDF with noise (posterior predictive)."""
+        """Summary of a new measurement, the BSDF with noise (posterior predictive)."""
         return self._summaries[1]
 
     @cached_property
@@ -197,9 +197,13 @@ class Prediction:
 class Scores:
     """Scores of predicted measurements.
 
-    count: measurements times channels. median_error, p95_error: median and 95th percentile of
-    |prediction / measurement - 1|, by the median prediction. model_error: the median of it by the stack's own value.
-    coverage: share of measurements in the central 50 % and 95 % intervals. elpd: mean log predictive density of one.
+    Attributes:
+        count: measurements times channels.
+        median_error: median of |prediction / measurement - 1|, for the median prediction.
+        p95_error: its 95th percentile.
+        model_error: its median for the stack without model discrepancy.
+        coverage: share of measurements in the central 50 % and 95 % intervals.
+        elpd: mean log predictive density of a measurement.
     """
 
     count: int

@@ -35,13 +35,13 @@ No power of 2: arrays of 2048 numbers get into each other's way in it, and gradi
 
 
 class Transport(eqx.Module):
-    """One way of solving a stack; its options are static fields.
+    """Base class of transports; options are static fields.
 
-    Directions come as components, already broadcast against each other; results are one array a channel. `state` is
-    what `prepare` returned: a pytree of arrays that holds all that no direction is needed for.
+    Directions are components that are broadcast against each other; results are one array per channel. `state` is what
+    `prepare` returned: a pytree of arrays with everything that does not depend on direction.
 
-    Three functions take whole batches instead, arrays ``(..., 3)``, and a `key` that is what `needed` made of the
-    user's: `measured`, `drawn` and `energies` are what the two halves of the contract differ in.
+    `measured`, `drawn` and `energies` take whole batches instead, arrays ``(..., 3)``, with a `key` that `needed` made
+    of the user's. They are defined by the two subclasses for deterministic and random transports.
     """
 
     random: ClassVar[bool]
@@ -51,7 +51,7 @@ class Transport(eqx.Module):
     """Whether `prepare_for` makes use of known directions."""
 
     side_by_side: ClassVar[int] = 1
-    """Texels of a map of stacks that are worked on together: `TEXELS` where a stack costs a few numbers."""
+    """How many texels of a map of stacks are computed together; `TEXELS` for stacks of a few numbers."""
 
     def together(self, stack: Stack) -> int:
         """Texels of a map of simplified stacks that are worked on together."""
@@ -144,7 +144,7 @@ class Transport(eqx.Module):
 
 
 class DeterministicTransport(Transport):
-    """A transport whose values are in closed form, or read off what `prepare` has solved."""
+    """A transport whose values are in closed form, or interpolated from what `prepare` has solved."""
 
     random: ClassVar[bool] = False
 
@@ -200,7 +200,7 @@ class DeterministicTransport(Transport):
 
 
 class RandomTransport(Transport):
-    """A transport that follows light at random: it takes a key, and gives standard errors too."""
+    """A transport by Monte Carlo: it takes a key, and also returns standard errors."""
 
     random: ClassVar[bool] = True
 
