@@ -1,4 +1,4 @@
-"""Stacks made ready for a transport: all the work that no direction is needed for, and what is left open chosen."""
+"""Preparation of a stack: everything that does not depend on direction, and the choice of the transport."""
 
 from collections.abc import Sequence
 from dataclasses import replace

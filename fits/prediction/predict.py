@@ -354,7 +354,7 @@ def _resampled_size(draws: int, pool: float) -> float:
 
 
 def with_discrepancy(fit: Fit, wi: Floats, wo: Floats, values: Floats) -> Floats:
-    """The BSDF of the best fit along other directions, (M, 3) each, where the stack alone has these values, (M, C)."""
+    """The BSDF of the best fit along other directions, (M, 3) each, given the stack's values there, (M, C)."""
     if fit.problem.model.process is None:
         return values
     _, floor = (np.asarray(part, float) for part in fit.problem.call(_noise_levels, fit.vector[None]))

@@ -66,7 +66,7 @@ class Transport(eqx.Module):
 
     @abc.abstractmethod
     def prepare(self, stack: Stack) -> Any:
-        """All the work that no direction is needed for, of a simplified stack."""
+        """Precompute everything that does not depend on direction, for a simplified stack."""
 
     def chosen_for(self, stack: Stack, known: Known) -> "Transport":
         """The same transport with all that it does not state chosen for the (simplified) stack and known directions."""
