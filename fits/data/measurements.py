@@ -102,7 +102,7 @@ class Measurements(Pairs):
         return f"<Measurements: {len(self):,} data points{note}, of {', '.join(self.channels)}, from {name}>"
 
     def used(self) -> Self:
-        """Only the samples that take part in fits."""
+        """Only the measurements that are used."""
         rows: dict[str, Any] = {}
         for name in ("wi", "wo", "values", "sigma", "mask", "kinds"):  # the last of `Totals`
             if (given := getattr(self, name, None)) is not None:
