@@ -15,13 +15,14 @@ class FitOptions:
     Attributes:
         same_values: two starts reached the same minimum if no parameter differs by more than this share of the range
             between its bounds, plus `same_errors` standard errors.
-        same_errors: see `same_values`; at most a twentieth of the range counts.
-        same_cost: and if their log-posteriors agree within this, times the reduced chi-square if that is above 1.
+        same_errors: standard errors in `same_values`, in total at most a twentieth of the range.
+        same_cost: largest difference of the log-posteriors of such starts, times the reduced chi-square if that is above
+            1.
         equivalent_cost: minima are equivalent if their log-posteriors differ by less than this, times the reduced
             chi-square if that is above 1.
         autocorrelation: a model discrepancy is added if residuals of neighbours along the scans are correlated by more
-            than this (see `Noise.discrepancy`),
-        autocorrelation_errors: and by more than so many standard errors.
+            than this and by more than `autocorrelation_errors` standard errors (see `Noise.discrepancy`).
+        autocorrelation_errors: see `autocorrelation`.
         numerical_error: largest numerical error of the model, in standard deviations of the data, if the resolution is
             chosen.
     """

@@ -109,10 +109,10 @@ class Fit:
         return str(shown_by("fits.reports.html:fit_fragment", self))
 
     def part(self, name: str = "") -> "Fit":
-        """What the fit of a `Joint` says of one measurement, with errors that all of them leave it; itself, if alone.
+        """The result for one data set of a `Joint`, with the errors of the joint fit; a fit of one data set itself.
 
-        It predicts by the normal approximation of what all measurements say; `Posterior.part` by their draws.
-        ValueError for a name that no measurement has.
+        It predicts in the normal approximation of the joint posterior, `Posterior.part` from its draws. ValueError for
+        an unknown name.
         """
         own = list(self.problem.places(name))
         problem = self.problem.problems[name]
@@ -143,13 +143,13 @@ class Fit:
         return found
 
     def require_one(self, what: str) -> None:
-        """ValueError, for `what` shows or keeps one measurement, of a fit of several."""
+        """Raise a ValueError if this is a joint fit; `what` is the function that needs one data set."""
         problems = self.problem.problems
         if problems.get("") is not self.problem:
             raise ValueError(f"{what}: of a joint fit it takes a part: fit.part(...) of {', '.join(problems)}")
 
     def require_posterior(self, what: str) -> None:
-        """ValueError, for `what` asks for the posterior anew, of a named objective, or of a part of a joint fit."""
+        """Raise a ValueError if the fit has no posterior of its own: a named objective, or a part of a joint fit."""
         if not self.is_posterior:
             raise ValueError(f"{what}: a fit of {self.problem.objective!r} has no noise model, and so no posterior")
         if self.dataset is not None:

@@ -54,12 +54,12 @@ class Transport(eqx.Module):
     """How many texels of a map of stacks are computed together; `TEXELS` for stacks of a few numbers."""
 
     def together(self, stack: Stack) -> int:
-        """Texels of a map of simplified stacks that are worked on together."""
+        """How many texels of a map of this (simplified) stack are computed together."""
         return self.side_by_side
 
     @abc.abstractmethod
     def check(self, stack: Stack, names: Sequence[str]) -> None:
-        """Raise a ValueError that names the first layer or base of a simplified stack which it cannot carry.
+        """Raise a ValueError that names the first layer or base of a simplified stack that is not supported.
 
         names: what the user calls the layers, such as ``layers[2]`` (see `layerjax.stack.simplify_and_name`).
         """
@@ -69,25 +69,25 @@ class Transport(eqx.Module):
         """Precompute everything that does not depend on direction, for a simplified stack."""
 
     def chosen_for(self, stack: Stack, known: Known) -> "Transport":
-        """The same transport with all that it does not state chosen for the (simplified) stack and known directions."""
+        """The same transport, with open options chosen for a simplified stack and known directions."""
         return self
 
     def chosen_for_energies(self, stack: Stack) -> "Transport":
-        """`chosen_for` energies alone, which no narrow lobe needs a finer resolution for."""
+        """Like `chosen_for`, for energies only, for which narrow lobes do not need a finer resolution."""
         return self.chosen_for(stack, lambda: None)
 
     def prepare_for(self, stack: Stack, known: Known) -> Any:
-        """`prepare` for values at known directions alone, for transports to which these are of use."""
+        """Like `prepare`, for values at known directions only."""
         return self.prepare(stack)
 
     def for_tracing(self, stack: Stack, known: Known) -> "Transport | None":
-        """What gives, within a program where all numbers of the simplified stack are traced, just what this one gives
-        outside, and can be differentiated forward; None: nothing does. Directions are known, and the stack is but for
-        what `grad` or its like differentiates by."""
+        """A transport with the same values, and with forward derivatives, inside a program where all parameters of the
+        simplified stack are traced; None if there is none. Directions are known, and so is the stack except for the
+        parameters by which it is differentiated."""
         return None
 
     def prepare_energies(self, stack: Stack) -> Any:
-        """`prepare` for `energies` alone, for transports that need less for these."""
+        """Like `prepare`, for `energies` only."""
         return self.prepare(stack)
 
     @abc.abstractmethod
@@ -100,20 +100,20 @@ class Transport(eqx.Module):
 
     @abc.abstractmethod
     def needed(self, key: Array | None, function: str) -> Array | None:
-        """The key; None, if it draws nothing. If one is missing, a ValueError for the public function of that name."""
+        """The key, or None for a deterministic transport. ValueError for `function` if it is missing."""
 
     @abc.abstractmethod
     def compared(self) -> "Sequence[Transport] | None":
-        """Transports for an error estimate; None, if `measured` knows them. If there is neither, a ValueError."""
+        """Transports for an error estimate; None if `measured` returns errors. ValueError if there is no estimate."""
 
     @abc.abstractmethod
     def measured(
         self, state: Any, wi: Array, wo: Array, side: Side, channels: int, key: Array | None
     ) -> tuple[Array, Array | None]:
-        """Values ``(..., C)`` of the BSDF in 1/sr, without the cosine, and their errors; None: it knows of none."""
+        """Values ``(..., C)`` of the BSDF in 1/sr, without the cosine, and their errors, or None."""
 
     def doubt(self, state: Any, wi: Array, wo: Array, side: Side, channels: int) -> Array | float:
-        """Error of values ``(..., C)`` in which all resolutions may agree, as where they are cut off below 0."""
+        """Further error of values ``(..., C)`` that all resolutions share, for example where they are clamped to 0."""
         return 0.0
 
     @abc.abstractmethod
