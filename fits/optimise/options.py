@@ -16,8 +16,7 @@ class FitOptions:
         same_values: two starts reached the same minimum if no parameter differs by more than this share of the range
             between its bounds, plus `same_errors` standard errors.
         same_errors: standard errors in `same_values`, in total at most a twentieth of the range.
-        same_cost: largest difference of the log-posteriors of such starts, times the reduced chi-square if that is above
-            1.
+        same_cost: largest difference of their log-posteriors, times the reduced chi-square if that is above 1.
         equivalent_cost: minima are equivalent if their log-posteriors differ by less than this, times the reduced
             chi-square if that is above 1.
         autocorrelation: a model discrepancy is added if residuals of neighbours along the scans are correlated by more
