@@ -61,15 +61,16 @@ class Prediction:
     """Predicted BSDF at M pairs of directions in C channels.
 
     Attributes:
-        wi, wo: directions, (M, 3).
+        wi: directions of the light, (M, 3).
+        wo: directions of the viewer, (M, 3).
         channels: C names.
-        values: the stack's own value for each of D draws of the posterior, (D, M, C), in 1/sr.
-        means, scales: location and scale of a measurement for each draw, (D, M, C), in 1/sr; with a discrepancy, of its
-            `logarithm`.
+        values: the value of the stack for each of D draws of the posterior, (D, M, C), in 1/sr.
+        means: location of a measurement for each draw, (D, M, C), in 1/sr; with a discrepancy, of its `logarithm`.
+        scales: its scale.
         softness: of that logarithm, (M, C) or (D, M, C), in 1/sr; None where values themselves are meant.
         discrepancy_sd: standard deviation of the discrepancy about `means`, (D, M, C), of the logarithm; None without.
         degrees_of_freedom: of Student's t; infinite for a Gaussian.
-        seed: of the draws that `bsdf` and `predictive` summarise.
+        seed: random seed of the draws that `bsdf` and `predictive` summarise.
         pareto_k: Pareto k of the importance weights that the draws of a fit's posterior are resampled by (see
             `fits.evidence`); NaN for draws of a chain.
         effective_draws: effective sample size of the D draws of the posterior.
