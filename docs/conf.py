@@ -45,6 +45,7 @@ autodoc_typehints = "none"  # shapes and units stand in the docstrings
 autodoc_preserve_defaults = True
 napoleon_numpy_docstring = False
 napoleon_use_ivar = True
+napoleon_attr_annotations = False
 
 html_theme = "furo"
 html_title = f"layerjax {version}"

@@ -27,17 +27,17 @@ def report(
     options: ReportOptions = DEFAULT,
     force: bool = True,
 ) -> None:
-    """Writes the report of a fit, or of a fitted map, to `path`, whole or not at all.
+    """Write the report of a fit or of a fitted map. A file that cannot be completed is not written.
 
     Args:
-        fit: a fit, or a map, finished or not, for which only `path` and `force` apply.
-        posterior: of the fit, if it was sampled.
-        path: HTML file to write, pictures inside.
+        fit: a fit; or a map, finished or not, which takes only `path` and `force`.
+        posterior: posterior of the fit, if it was sampled.
+        path: HTML file, which includes its pictures.
         others: further fits of the same data, or their posteriors, by name, to be compared with this one.
-        name: what this fit is called beside `others`.
+        name: name of this fit among `others`.
         held_out: measurements that were not fitted, to be shown with their prediction.
         options: thresholds that decide what the report of a fit says.
-        force: replace a file that is there.
+        force: replace an existing file.
 
     Raises:
         ValueError: `path` exists and `force` is False, `others` cannot be compared with this fit, or it is one of

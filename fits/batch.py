@@ -88,11 +88,11 @@ def fit_file(
 
 @dataclass(frozen=True)
 class FittedFiles:
-    """What became of every file and stack.
+    """Results of `fits.fit_files`.
 
     Attributes:
-        directory: where results and table are.
-        rows: a mapping for each file and stack, as a line of the table: `file`, `stack`, `result` ("converged", "not
+        directory: directory of results and table.
+        rows: one mapping per file and stack, as in the table: `file`, `stack`, `result` ("converged", "not
             converged" or "failed"), `status` (of the fit, or why there is none), `standing` among the stacks of the
             file; of a fit `criterion` and `loss`, by which stacks are ranked (-2 log predictive density of held-out
             data, else AIC, else the named objective), `reduced_chi_square`, with and without the model discrepancy,
@@ -131,8 +131,8 @@ def fit_files(
 ) -> FittedFiles:
     """Fit every measurement file by every stack, each into a result directory ``out/FILE/STACK``, and tabulate them.
 
-    What is there already is not done again; a run that was interrupted is resumed. A file that cannot be read, or a fit
-    that fails, is a row with the reason, and the others are fitted.
+    Finished fits are not repeated, so that an interrupted run resumes. A file that cannot be read, or a fit that fails,
+    is a row with the reason.
 
     Args:
         files: a folder, of which files that hold no measurements are skipped, or files and folders.
@@ -141,9 +141,9 @@ def fit_files(
         processes, client: see `fits.engines.connected`; with 1, fits come one after the other, each on all cores.
             Workers of a cluster see files and `out` by these paths.
         read_options: how all files are read, see `fits.ReadOptions`.
-        starts, seed: of each fit of `stacks`, see `fits.fit`.
-        reports: with a report of each, whose pictures take longer than a fit by a transport in closed form.
-        force: fit again what is there of another stack, of other settings or of what a file held before.
+        starts, seed: of each fit, see `fits.fit`.
+        reports: whether each fit gets a report, which takes longer than a fit by a transport in closed form.
+        force: replace fits of another stack, other settings or changed files.
         progress: called with ("fits", done, all, file and stack).
 
     Raises:

@@ -245,16 +245,16 @@ def search(
     directory: str | Path | None = None,
     progress: Progress | None = None,
 ) -> Search:
-    """Look for the stack behind the data among those that a library's layers and bases make.
+    """Search for the stack that predicts the data best, built from a library of layers and bases.
 
     Args:
-        data: only the samples that its mask leaves in are used.
+        data: measurements; masked ones are not used.
         library: `default_library` for the channels of the data, if None.
         transport, noise, scale, instrument: see `Problem`; "auto" carries all orders of scattering.
         seed: of the starts, see `fit`.
         options: how far the search goes.
-        directory: keeps every fit and every cross-validation as it is finished: a search that was killed, or that ended
-            with fewer layers, is resumed there. The fits are result directories.
+        directory: directory of finished fits and cross-validations, from which a search resumes, also one that ended
+            with fewer layers. The fits are result directories.
         progress: called with (what is done, structures done, structures of this level, note).
 
     Raises:

@@ -1,6 +1,6 @@
 """Conventions, and elementary geometry of directions.
 
-THE CONVENTIONS (everything else in the package links here)
+Everything else in the package refers to these conventions:
 
 - Local frame: z is the macroscopic normal and points out of the top of the stack.
 - ``wi`` points towards the light, ``wo`` towards the viewer; both are unit vectors of shape ``(..., 3)`` that point
@@ -8,7 +8,7 @@ THE CONVENTIONS (everything else in the package links here)
 - Angles are in radians here, in degrees in files and on the command line. ``direction(theta, phi)`` has polar angle
   theta from +z and azimuth phi from +x; ``phi_o = phi_i + pi`` is the mirror direction.
 - A BSDF value f is in 1/sr and does not contain the cosine. Channels are the last axis and always there.
-- Radiance is carried; between media of different index, reciprocity holds for f / ior_o^2.
+- Transports compute radiance, not importance. Between media of different index, reciprocity holds for f / ior_o^2.
 
 Inside the package a direction is a tuple ``(x, y, z)`` of arrays (`Vector`): separate components keep XLA from
 shuffling an inner axis of three. Functions of components take any shapes that broadcast, and return their common shape.

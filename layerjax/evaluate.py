@@ -52,22 +52,20 @@ def evaluate(
     """BSDF in 1/sr, without the cosine.
 
     Args:
-        stack: the layered material, or what `prepare` made of it (`transport` is then the one it was prepared for); or
-            a map of stacks of shape S (see `Stack`), against whose axes the last ones of the directions broadcast.
-        wi: unit directions towards the light, shape ``(..., 3)``, pointing away from the surface. Concrete ones that
-            are not of unit length are refused; traced ones (under `jit`, `grad`, `vmap`) cannot be, and give wrong
-            numbers.
+        stack: the layered material, or the result of `prepare` (`transport` is then the one it was prepared for); or a
+            map of stacks of shape S (see `Stack`), whose axes broadcast against the last ones of the directions.
+        wi: unit directions towards the light, shape ``(..., 3)``, pointing away from the surface. Directions that are
+            not of unit length raise an error, except under `jit`, `grad` or `vmap`, where they give wrong values.
         wo: unit directions towards the viewer, shape ``(..., 3)``. Same side as wi: reflection; opposite: transmission.
         transport: see `prepare`.
         side: the pairs that are evaluated: ``"all"``; ``"reflection"``, both above; ``"transmission"``, one above and
-            one below. Other pairs give 0, and what only they need is not in the program.
+            one below. Other pairs give 0 and cost nothing.
         key: a JAX random key, which `RandomWalk` needs and others ignore. The same key gives the same values.
 
     Returns:
-        Values of shape ``broadcast(wi, wo)[:-1] + (C,)``, of a map ``broadcast(S, wi[..., 0], wo[..., 0]) + (C,)``, in
-        the floating type of the directions, the channel axis last. A direction in the tangent plane gives 0. Of a map
-        every texel is what its stack alone gives, in chunks that stay in the cache; the resolution of `"auto"` and
-        `AddingDoubling` is chosen once, for the texel that needs the finest.
+        Values of shape ``broadcast(wi, wo)[:-1] + (C,)``, for a map ``broadcast(S, wi[..., 0], wo[..., 0]) + (C,)``, in
+        the floating type of the directions. A direction in the tangent plane gives 0. The resolution of `"auto"` and
+        `AddingDoubling` is the same for all texels of a map: that of the texel that needs the finest.
     """
     return evaluate_known(stack, wi, wo, transport, side=side, key=key)
 
@@ -131,12 +129,13 @@ def evaluate_with_error(
 ) -> tuple[Array, Array]:
     """BSDF as `evaluate` gives it, and an estimate of its error, of the same shape.
 
-    For `RandomWalk` (which needs a `key`) that is the standard error of each value; for a transport of finite
-    resolution the distance to its values at the next coarser and finer one, for which the stack itself must be
-    given: no less, relative to the value, than at neighbouring pairs of directions, and with what was cut off below 0.
+    For `RandomWalk`, which needs a `key`, the error is the standard error of each value. For a transport of finite
+    resolution it is the difference to the next coarser and finer resolution, for which the stack itself must be given
+    and not a prepared one. Relative to the value, it is at least as large as at neighbouring pairs of directions.
 
     Raises:
-        ValueError: the transport has neither, or a prepared stack is given to one that needs other resolutions.
+        ValueError: the transport has no error estimate, or a prepared stack is given where other resolutions are
+            needed.
     """
     require_choice("side", side, get_args(Side))
     wi, wo = read_directions(wi=wi, wo=wo)
@@ -164,8 +163,8 @@ def sample(
 
     Returns:
         ``wo`` of shape ``(..., 3)``; its density ``pdf`` in 1/sr, shape ``(...)``; and ``weight = f |cos_o| / pdf``
-        of shape ``(..., C)``, whose mean is the albedo. Draws that leave no light (below an opaque base, say) have
-        weight 0, and a direction in the tangent plane if they have none.
+        of shape ``(..., C)``, whose mean is the albedo. Draws without light, for example below an opaque base, have
+        weight 0; a draw without a direction is in the tangent plane.
     """
     require_key(key)
     (wi,) = read_directions(wi=wi)
@@ -207,9 +206,9 @@ def albedo(
 ) -> tuple[Array, Array]:
     """Directional albedo: the shares of light along wi that are reflected and transmitted, ``(..., C)`` each.
 
-    The part that passes without scattering is not in it (see `unscattered`). By quadrature adapted to every lobe, with
-    `nodes` Gauss points a dimension and panel: 32 give 1e-6 as a rule, and 4e-3 at worst over the documented box, where
-    light grazes lobes of alpha 1e-4. `RandomWalk` follows light instead of that, and needs a `key`.
+    Ballistic light is not included (see `unscattered`). The BSDF is integrated by quadrature that is adapted to each
+    lobe, with `nodes` Gauss points per dimension and panel. The error with 32 is 1e-6 as a rule, and 4e-3 at worst, for
+    grazing light and lobes of alpha 1e-4. `RandomWalk` counts paths instead, and needs a `key`.
 
     Maps of stacks as in `evaluate`.
     """
@@ -230,7 +229,8 @@ def albedo(
 def unscattered(stack: Stack | Mixture, wi: ArrayLike) -> Array:
     """Share of radiance along wi that passes the stack without a collision, shape ``(..., C)``.
 
-    The delta part of the BSDF: 0 over an opaque base and through rough interfaces. Maps of stacks as in `evaluate`.
+    This is the delta component of the BSDF. It is 0 over an opaque base and through rough interfaces. Maps of stacks as
+    in `evaluate`.
     """
     require_material(stack)
     require_numbers(stack)

@@ -34,17 +34,17 @@ _TAKEN = ("weights", "parts", "layers", "base", "scale", "noise")
 class Mixture(Shown):
     """Stacks side by side, each covering a share of the area; no light passes from one to another.
 
-    It stands wherever a `Stack` may. Its BSDF, albedo and what passes unscattered are the means of those of its parts;
-    a direction is drawn from a part that is drawn by its weight, with the density of all of them.
+    A mixture can be used wherever a `Stack` can. Its BSDF, albedo and ballistic transmission are the weighted means of
+    those of its parts. To sample a direction, a part is drawn by its weight; the density is that of the mixture.
 
     Args:
-        parts: stacks, or mixtures, by name: letters, digits, ``-`` and ``_``, a letter first.
-        weights: shares of the area in [0, 1], in the order of the parts or by name, which sum to 1. One may be None: it
-            covers the rest. Of shape (), or that of a map (see `layerjax._shapes`).
+        parts: stacks or mixtures by name; names begin with a letter and hold letters, digits, ``-`` and ``_``.
+        weights: shares of the area in [0, 1] that sum to 1, by name or in the order of the parts. One may be None: the
+            rest of the area. Each has shape (), or that of a map.
 
     Raises:
-        ValueError: names or weights that are missing or wrong, weights that do not sum to 1, a placeholder without a
-            weight that is None, or parts that disagree on channels or the shape of a map.
+        ValueError: names or weights are missing or invalid, weights do not sum to 1, a weight is free and none is None,
+            or parts disagree on channels or the shape of a map.
     """
 
     parts: dict[str, Any]

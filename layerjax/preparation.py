@@ -1,4 +1,4 @@
-"""Stacks made ready for a transport: all the work that no direction is needed for, and what is left open chosen."""
+"""Preparation of a stack: everything that does not depend on direction, and the choice of the transport."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -37,17 +37,15 @@ def prepare(stack: Stack, transport: Transport | Literal["auto"] = "auto") -> Pr
 def prepare(stack: Mixture, transport: Transport | Literal["auto"] = "auto") -> Mixture: ...
 @broadcasting
 def prepare(stack: Stack | Mixture, transport: Transport | Literal["auto"] = "auto") -> Prepared | Mixture:
-    """Do all the work that no direction is needed for, once.
+    """Precompute everything that does not depend on direction.
 
     Args:
-        stack: the layered material; of a mixture each part is prepared, unless it is, and a mixture of these is
-            returned.
-        transport: how light is carried. ``"auto"``: all orders of scattering. `SingleScattering` where nothing
-            scatters light twice (a base under media that are known only to absorb), else `AddingDoubling`, which by
-            measurement is nearer to the truth than the closed forms of `Statistical`.
+        stack: the layered material. Of a mixture, each part is prepared, and a mixture of prepared parts is returned.
+        transport: the light transport model. ``"auto"`` includes all orders of scattering: it is `SingleScattering` for
+            a base under media that are known to absorb only, where it is exact, and `AddingDoubling` for all others.
 
     Raises:
-        ValueError: the stack holds a placeholder, or something that the transport cannot carry (it is named).
+        ValueError: the stack holds a placeholder, or a layer or base that the transport does not support.
     """
     require_material(stack)
     if isinstance(stack, Mixture):
@@ -63,15 +61,16 @@ def choose_transport(
 ) -> Transport:
     """The transport that `evaluate` uses, with its resolution: what `"auto"` and `AddingDoubling` leave to the stack.
 
-    Called outside of ``jit`` and given inside, it buys speed: there numbers are not known, and lobes count as narrow.
+    Call it outside of ``jit``, and pass the result to `evaluate` inside, where the values of parameters are not known
+    and narrow lobes have to be assumed::
 
         transport = lj.choose_transport(stack, wi, wo)
         fast = jax.jit(lambda stack: lj.evaluate(stack, wi, wo, transport))
 
     Args:
-        stack: the layered material. What is traced in it counts as not known. Of a mixture `evaluate` chooses for each
-            part; here that which carries all of them, as fine as the part needs that needs most.
-        wi, wo: directions of `evaluate`, as there. None: they are many, or not known.
+        stack: the layered material; traced parameters count as not known. For a mixture, the transport supports all
+            parts, at the finest resolution that one of them needs.
+        wi, wo: the directions, as in `evaluate`. None: many, or not known.
         transport: see `prepare`.
 
     Raises:

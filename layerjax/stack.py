@@ -29,21 +29,29 @@ LEAST_EXTINCTION = 1e-10
 
 
 class Interface(Shown):
-    """Rough dielectric interface of microfacets.
+    """Rough dielectric interface of microfacets (Walter et al. 2007).
 
-    ============ ====== ========== ======= ==========================================================================
-    parameter    symbol range      default meaning
-    ============ ====== ========== ======= ==========================================================================
-    ior          eta    [0.25, 4]          index of what lies below, relative to what surrounds the stack
-    alpha        alpha  [1e-4, 1]          width of the normals; for ``"vmf"`` [1e-4, 15], with kappa = 2 / alpha^2
-    distribution D      "ggx" or   "ggx"   of the normals: GGX, or von Mises-Fisher (carried by `ENDF`, and, with
-                        "vmf"              ``facet_multiple_scattering=False``, `AddingDoubling`, `RandomWalk`)
-    ============ ====== ========== ======= ==========================================================================
+    With Fresnel term F, distribution of normals D and masking G = G1(wi) G1(wo), reflection and transmission are::
 
-    Light that the masking of Walter et al. 2007 blocks is lost, also where the index hardly changes: with ior 1.001
-    and alpha 0.3 a passage at 75 degrees loses 20 %, and a base that is lit and seen at 75 degrees is 36 % darker.
-    Transports with ``facet_multiple_scattering=True`` carry on what facets block; where the index does not change, omit
-    the interface (one of exactly the index above it is omitted automatically).
+        F D G / (4 cos_i cos_o)
+        eta_o^2 abs(wi.h wo.h) (1 - F) D G / (cos_i cos_o (eta_i wi.h + eta_o wo.h)^2)
+
+    ============ ====== ===== ==== ============ ======== ============== ================================================
+    parameter    symbol shape unit range        default  differentiable meaning
+    ============ ====== ===== ==== ============ ======== ============== ================================================
+    ior          eta    ()    1    [0.25, 4]    required yes            refractive index of the medium below, relative
+                                                                        to the surroundings of the stack
+    alpha        alpha  ()    1    [1e-4, 1]    required yes            width of D; [1e-4, 15] for ``"vmf"``, where
+                                                                        kappa = 2 / alpha^2
+    distribution D                 "ggx", "vmf" "ggx"    no             GGX or von Mises-Fisher; the latter only in
+                                                                        `ENDF`, and in `AddingDoubling` and `RandomWalk`
+                                                                        with ``facet_multiple_scattering=False``
+    ============ ====== ===== ==== ============ ======== ============== ================================================
+
+    Light that is blocked by masking is lost, also where the index hardly changes: with ior 1.001 and alpha 0.3, light
+    at 75 degrees loses 20 % at a crossing, and a base that is lit and viewed at 75 degrees is 36 % darker. Transports
+    with ``facet_multiple_scattering=True`` include this light. Omit an interface where the index does not change; one
+    with exactly the index above it is omitted automatically.
     """
 
     ior: Parameter = parameter("Interface.ior")
@@ -57,17 +65,20 @@ class Interface(Shown):
 class Medium(Shown):
     """Plane-parallel medium that absorbs and scatters.
 
-    ========= ====== ================== ================ ==========================================================
-    parameter symbol range              default          meaning
-    ========= ====== ================== ================ ==========================================================
-    thickness tau    [0, 1e4]                            optical depth T rho, per channel; extinction along w is
-                                                         thickness * sigma(w)
-    albedo    gamma  [0, 1]             1                share that survives a collision, per channel; 0 absorbs only
-    phase            HenyeyGreenstein,  HenyeyGreenstein where a collision sends the light; any `PhaseFunction`
-                     SGGX, Rayleigh     (g=0)
-    f0        F0     [0, 1]             None             Schlick reflectance of a flake, per channel; every collision
-                                                         keeps albedo * schlick(f0). None or 1: no Fresnel term
-    ========= ====== ================== ================ ==========================================================
+    Light along w is attenuated by exp(-thickness sigma(w) / cos); a collision scatters it by albedo schlick(f0)
+    p(wi, wo), with sigma and p of the phase function.
+
+    ========= ====== ======== ==== =============== ========= ============== ============================================
+    parameter symbol shape    unit range           default   differentiable meaning
+    ========= ====== ======== ==== =============== ========= ============== ============================================
+    thickness tau    (), (C,) 1    [0, 1e4]        required  yes            optical depth T rho
+    albedo    gamma  (), (C,) 1    [0, 1]          1         yes            single-scattering albedo; 0: the medium only
+                                                                            absorbs
+    phase     p                    `PhaseFunction` isotropic yes            `HenyeyGreenstein`, `SGGX`, `Rayleigh` or a
+                                                                            class of your own
+    f0        F0     (), (C,) 1    [0, 1]          None      yes            Schlick reflectance of a flake at normal
+                                                                            incidence; None and 1: no Fresnel term
+    ========= ====== ======== ==== =============== ========= ============== ============================================
     """
 
     thickness: Parameter = parameter("Medium.thickness")
@@ -80,19 +91,20 @@ class Medium(Shown):
 
 
 class TurbidMedium(Shown):
-    """A `Medium` by its thickness and its coefficients, as tissue and pigments are measured.
+    """A `Medium` that is specified by its thickness and coefficients, as tissue and pigments are measured.
 
-    ============ ====== ========== ======= ===========================================================================
-    parameter    symbol range      default meaning
-    ============ ====== ========== ======= ===========================================================================
-    thickness_mm d      [0, 1e4]           in millimetres
-    mu_s         mu_s   [0, 1e4]           coefficient of scattering, 1/mm, per channel; not the reduced one, which is
-                                           mu_s (1 - g)
-    mu_a         mu_a   [0, 1e4]   0       coefficient of absorption, 1/mm, per channel
-    phase, f0                              as of a `Medium`
-    ============ ====== ========== ======= ===========================================================================
+    Its optical depth is (mu_s + mu_a) d, at most 1e4, and its albedo mu_s / (mu_s + mu_a).
 
-    The optical depth is (mu_s + mu_a) d, at most 1e4, the albedo mu_s / (mu_s + mu_a).
+    ============ ====== ======== ==== =============== ========= ============== =======================================
+    parameter    symbol shape    unit range           default   differentiable meaning
+    ============ ====== ======== ==== =============== ========= ============== =======================================
+    thickness_mm d      ()       mm   [0, 1e4]        required  yes            thickness
+    mu_s         mu_s   (), (C,) 1/mm [0, 1e4]        required  yes            scattering coefficient; not the reduced
+                                                                               one, which is mu_s (1 - g)
+    mu_a         mu_a   (), (C,) 1/mm [0, 1e4]        0         yes            absorption coefficient
+    phase        p                    `PhaseFunction` isotropic yes            as of a `Medium`
+    f0           F0     (), (C,) 1    [0, 1]          None      yes            as of a `Medium`
+    ============ ====== ======== ==== =============== ========= ============== =======================================
     """
 
     thickness_mm: Parameter = parameter("TurbidMedium.thickness_mm")
@@ -126,16 +138,16 @@ def _check_phase(owner: str, phase: Any) -> None:
 class Stack(Shown):
     """Layers from top to bottom over a base.
 
-    Numbers of shape ``(N,)`` or ``(H, W)`` make it a map of stacks, one for every texel: see `layerjax._shapes` for how
-    they are distinguished from channels.
+    Parameters of shape ``(N,)`` or ``(H, W)`` make it a map of stacks, one for each texel (see the guide on maps).
 
     Args:
         layers: any number of `Interface`, `Medium` and `TurbidMedium`, the topmost first.
-        base: an opaque surface (`Lambertian`, `OrenNayar`, `VMFDiffuse`, `Conductor`), or None: light passes.
+        base: an opaque surface (`Lambertian`, `OrenNayar`, `VMFDiffuse`, `Conductor`), or None for a stack that
+            transmits light.
 
     Raises:
-        ValueError: something else stands in the list, or parameters disagree on the number of channels or the shape of
-            the map.
+        ValueError: a layer or the base has another type, or parameters disagree on the number of channels or the shape
+            of the map.
     """
 
     layers: tuple[Interface | Medium, ...]  # and turbid media, until `simplify`

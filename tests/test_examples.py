@@ -26,7 +26,7 @@ def test_the_table_of_predictions_rounds_the_results() -> None:
     rows = json.loads((ROOT / "benchmarks" / "results" / "held-out.json").read_text())["rows"]
     found = {(row["coating"], row["stack"], row["discrepancy"]): row for row in rows}
     text = (ROOT / "examples" / "README.md").read_text()
-    header, _, *lines = text[text.index("| stack | what it says | Aeroglaze") :].split("\n\n")[0].splitlines()
+    header, _, *lines = text[text.index("| file | layers and base | Aeroglaze") :].split("\n\n")[0].splitlines()
     coatings = [cell.strip() for cell in header.split("|")[3:6]]
     table = [(line.split("|"), line.split("`")[1].removesuffix(".toml")) for line in lines]
     assert 2 * len(table) * len(coatings) == len(found)

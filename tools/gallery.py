@@ -20,6 +20,9 @@ PICTURES = ROOT / "docs" / "gallery"
 SPHERE, WIDTH, QUALITY = 256, 1000, 88
 """Pixels of a sphere and of a picture, and how well a JPEG keeps it: about 70 kB each."""
 
+COLUMNS = 70
+"""Width of the code, which stands beside the picture on a wide screen."""
+
 BEGINNING = """\
 # Gallery
 
@@ -53,20 +56,29 @@ def page() -> str:
 
 
 def _stack(tables: dict[str, Any]) -> str:
-    layers = "".join(f"        {_call(layer)},\n" for layer in tables["layers"])
-    base = _call(tables["base"]) if "base" in tables else "None"
+    layers = "".join(f"        {_call(layer, 8)},\n" for layer in tables["layers"])
+    base = _call(tables["base"], 4, "base=") if "base" in tables else "None"
     return f"lj.Stack(\n    layers=[\n{layers}    ],\n    base={base},\n)"
 
 
-def _call(table: dict[str, Any]) -> str:
-    """What makes the part that a table of a stack file says."""
-    words = (f"{key}={_value(value)}" for key, value in table.items() if key not in ("kind", "shape"))
-    shape = [repr(table["shape"]).replace("'", '"')] if "shape" in table else []
-    return f"lj.{table['kind']}({', '.join([*shape, *words])})"
+def _call(table: dict[str, Any], indent: int, name: str = "") -> str:
+    """The code of a part of a stack file, an argument a line where one line would be longer than COLUMNS."""
+    keys = sorted(table.keys() - {"kind"}, key=lambda key: (key != "shape", list(table).index(key)))
+    items = [(key, "" if key == "shape" else f"{key}=") for key in keys]
+    words = [word + _value(table[key], indent + 4, word) for key, word in items]
+    line = f"lj.{table['kind']}({', '.join(words)})"
+    if "\n" not in line and indent + len(name) + len(line) < COLUMNS:
+        return line
+    body = "".join(f"{' ' * (indent + 4)}{word},\n" for word in words)
+    return f"lj.{table['kind']}(\n{body}{' ' * indent})"
 
 
-def _value(value: Any) -> str:
-    return _call(value) if isinstance(value, dict) else repr(value).replace("'", '"')
+def _value(value: Any, indent: int, name: str = "") -> str:
+    if isinstance(value, dict):
+        return _call(value, indent, name)
+    if isinstance(value, list):
+        return f"[{', '.join(_value(part, indent) for part in value)}]"
+    return repr(value).removesuffix(".0").replace("'", '"')
 
 
 def picture(name: str) -> bytes:

@@ -126,8 +126,8 @@ def page() -> str:
     lines = [
         "# Papers to functions",
         "",
-        "Where the equations and sections of each paper stand in the source. Made from its docstrings and comments by",
-        "`python -m tools.papers`; what is put right on the way is in [errata.md](errata.md).",
+        "This page lists the functions that implement each equation or section of a paper. `python -m tools.papers`",
+        "generates it from docstrings and comments. [Errata](errata.md) lists corrections.",
     ]
     for paper in PAPERS:
         if paper not in citations_of:

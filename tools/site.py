@@ -33,6 +33,7 @@ TAKEN = {
 
 LINK = re.compile(r"(?<!!)\[(?P<text>(?:[^\[\]]|\[[^\]]*\])*)\]\((?P<target>[^)#:]+)(?P<anchor>#[^)]*)?\)")
 PICTURE = re.compile(r"(?P<head>!\[[^\]]*\]\()(?P<target>[^)#:]+)\)")
+IMAGE = re.compile(r'<img [^>]*?src="(?P<src>[^"]*_images/[^"]*)"[^>]*>')
 BARS = re.compile(r"\|(\S(?:[^|]*\S)?)\|")
 FENCE = re.compile(r"(^ *```.*?^ *```)", re.DOTALL | re.MULTILINE)
 
@@ -44,6 +45,7 @@ def setup(app: Sphinx) -> dict[str, bool]:
     """Called by Sphinx."""
     app.connect("builder-inited", lambda app: write_pages(Path(app.srcdir)))
     app.connect("source-read", _read)
+    app.connect("html-page-context", _link_pictures)
     app.connect("autodoc-process-docstring", _bars)
     app.connect("html-collect-pages", _source_pages)
     return {"parallel_read_safe": True, "parallel_write_safe": True}
@@ -117,6 +119,11 @@ def _relative(path: Path, page: str) -> str:
 def _read(app: Sphinx, page: str, source: list[str]) -> None:
     if page not in TAKEN.values() and app.env.doc2path(page).suffix == ".md":
         source[0] = linked(source[0], Path(app.env.doc2path(page)), page)
+
+
+def _link_pictures(app: Sphinx, page: str, template: str, context: dict[str, Any], doctree: Any) -> None:
+    """A picture is a link to its file, where labels can be read that are small on a narrow screen."""
+    context["body"] = IMAGE.sub(r'<a href="\g<src>">\g<0></a>', context.get("body", ""))
 
 
 def _bars(app: Sphinx, what: str, name: str, documented: Any, options: Any, lines: list[str]) -> None:

@@ -39,13 +39,13 @@ WITHIN, WITHIN_RING = 12, 24
 """Gauss points along each side of a bin, and of a ring."""
 
 TEXT = """\
-# Directional statistics beside the walk
+# Layered statistics compared with the random walk
 
 {environment}
-`Statistical(symmetric=False)` and, in brackets, the symmetric model, with their other options as they are by default,
-beside `RandomWalk(facet_multiple_scattering=True)` with {paths:,} paths an angle. *Estimate* is what the corrected
-2018 model has been found to reach by others (with noise of 0.02 to 0.03 in its total variation); a star marks what is
-beyond it by more than 0.5 % and 0.02.
+`Statistical(symmetric=False)` and, in brackets, the symmetric model, with default options, compared with
+`RandomWalk(facet_multiple_scattering=True)` with {paths:,} paths per angle. *Estimate* is the error of the corrected
+2018 model in other work (with noise of 0.02 to 0.03 in its total variation); a star marks errors above it by more than
+0.5 % and 0.02.
 
 ## Albedo and shape
 

@@ -51,7 +51,12 @@ class Pairs:
 
 @dataclass(frozen=True, eq=False)
 class Geometry(Pairs):
-    """Pairs of directions to measure at: `wi` and `wo`, (N, 3) float64 unit vectors pointing away from the surface."""
+    """Pairs of directions of light and viewer, for example to predict or simulate measurements.
+
+    Args:
+        wi: (N, 3), unit vectors towards the light, pointing away from the surface.
+        wo: (N, 3), unit vectors towards the viewer.
+    """
 
     wi: Floats
     wo: Floats

@@ -44,20 +44,20 @@ TO_HAVE_THEM = "fits.read(path) reads a file, fits.Measurements(wi, wo, values, 
 
 @dataclass(frozen=True, eq=False)
 class Measurements(Pairs):
-    """N samples of a BSDF in C channels.
+    """N measurements of a BSDF in C channels.
 
     Args:
         wi: (N, 3) unit vectors towards the light, pointing away from the surface.
         wo: (N, 3) unit vectors towards the viewer, pointing away from the surface.
         values: (N, C), BSDF in 1/sr without the cosine, at most 1e30 in size.
-        sigma: (N, C), standard deviations in 1/sr, at least 1e-100 in used samples; None where nothing is known.
-        mask: (N,) bool, True where a sample takes part in fits.
+        sigma: (N, C), standard deviations in 1/sr, at least 1e-100 in used measurements; None if they are unknown.
+        mask: (N,) bool, True for measurements that are used.
         channels: C names.
-        source: where the samples came from.
+        source: origin of the data.
 
     Raises:
-        ValueError: shapes do not fit together, a number is not finite or too large, a direction is no unit vector, or
-            sigma is negative, or next to zero in a sample that is used.
+        ValueError: shapes do not agree, a number is not finite or too large, a direction is not a unit vector, or sigma
+            is negative, or nearly zero in a measurement that is used.
     """
 
     wi: Floats
@@ -102,7 +102,7 @@ class Measurements(Pairs):
         return f"<Measurements: {len(self):,} data points{note}, of {', '.join(self.channels)}, from {name}>"
 
     def used(self) -> Self:
-        """Only the samples that take part in fits."""
+        """Only the measurements that are used."""
         rows: dict[str, Any] = {}
         for name in ("wi", "wo", "values", "sigma", "mask", "kinds"):  # the last of `Totals`
             if (given := getattr(self, name, None)) is not None:

@@ -24,20 +24,21 @@ def read(path: str | Path, format: str | None = None, quantity: str | None = Non
 
     Args:
         path: the file.
-        format, quantity: what it is, and what its numbers are; None finds out from the content.
+        format: format of the file; None: recognised by the content.
+        quantity: quantity of its values; None: as the file states.
         options: further fields of `fits.ReadOptions`, such as ``bins=5000`` or ``max_polar_angle=80``.
 
     Raises:
         FileNotFoundError: there is no such file.
         ValueError: on one line, which names the file and, where there is one, line, column, value and allowed range.
-        TypeError: an option that is none.
+        TypeError: an unknown option.
     """
     return ReadOptions(format, quantity, **options).read(path)
 
 
 @dataclass(frozen=True, eq=False)
 class ReadOptions(FileOptions):
-    """How files are read, of `fits.read`, `fits.fit_files` and the command line, whose options have these names.
+    """Options of `fits.read`, `fits.fit_files` and the command line for reading files.
 
     Args:
         format: "csv", "totals" (a CSV with shares of light, which gives `Totals`), "rxt" (the totals of a slab, see
@@ -53,7 +54,7 @@ class ReadOptions(FileOptions):
         bins: for MERL and RGL only: so many bins, or nodes, from all over the table, at most 100,000, or "all".
         strata: for MERL only, what each of these bins stands for an equal share of: "bins" of the table, or "flux",
             the projected solid angle of light and viewer.
-        seed: of their choice.
+        seed: random seed of the choice.
         wavelengths, corrected: for iad's files only: see `read_slab`.
         min_retro_angle: mask measurements closer than so many degrees to retro-reflection.
         max_polar_angle: mask measurements more than so many degrees from the normal.

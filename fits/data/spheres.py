@@ -22,8 +22,16 @@ from fits._files import require_switch
 
 @dataclass(frozen=True)
 class Sphere:
-    """An integrating sphere. Diameters in mm of the sphere and of its ports for sample, light (`entrance`, 0 if closed)
-    and detector; reflectances of the wall, in [0, 1), and of the detector."""
+    """An integrating sphere, of which `sample`, `entrance` and `detector` are ports.
+
+    Args:
+        diameter: of the sphere, in mm.
+        sample: diameter of the port, in mm.
+        entrance: diameter of the port of the light, in mm; 0 if closed.
+        detector: diameter of the port, in mm.
+        wall: reflectance of the wall, in [0, 1).
+        detector_reflectance: reflectance of the detector, in [0, 1).
+    """
 
     diameter: float
     sample: float
@@ -77,9 +85,12 @@ class Shares(NamedTuple):
 class Spheres:
     """Integrating spheres before and behind a sample; the collimated beam is incident on the sample.
 
-    reflection, transmission: the spheres, None if there is none. standard: reflectance of the standard that the
-    reflection sphere is calibrated with, in (0, 1]; the transmission sphere is calibrated without a sample. together:
-    both are in place at the same time and exchange light through the sample (double integrating sphere).
+    Args:
+        reflection: the sphere before the sample, or None.
+        transmission: the sphere behind the sample, or None; it is calibrated without a sample.
+        standard: reflectance of the standard of the reflection sphere, in (0, 1].
+        together: whether both are in place at the same time and exchange light through the sample (double integrating
+            sphere).
     """
 
     reflection: Sphere | None = None

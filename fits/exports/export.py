@@ -43,7 +43,13 @@ ENDINGS: dict[str, str] = {
 
 @dataclass(frozen=True)
 class ExportReport:
-    """A written file. notes: what it holds, how accurately, and what it omits, one sentence each."""
+    """A written file.
+
+    Attributes:
+        path: the file.
+        to: its format.
+        notes: what it holds, how accurately, and what it omits, one sentence each.
+    """
 
     path: Path
     to: To
@@ -66,7 +72,7 @@ def export(
 
     Args:
         material: a stack or a mixture without free parameters, or a fit, whose best values are written.
-        path: the file; its name ends as `ENDINGS` says.
+        path: the file, with the ending of the format.
         to: the format. "rgl": RGL's tensor file, which Mitsuba and pbrt read. "merl": a MERL table. "zemax": Zemax and
             LightTools. "klems": matrices in the XML of WINDOW, which Radiance reads. "openpbr": the closest OpenPBR
             surface in MaterialX (extra `materialx`). "csv": slices in this project's convention.

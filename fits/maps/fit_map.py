@@ -56,11 +56,11 @@ def fit_map(
 ) -> FittedMap:
     """Fit a stack to the measurements of every texel of a map, into a zarr store that grows chunk by chunk.
 
-    What is in the store is not done again, and what comes to be in it does not depend on who did the work.
+    Finished chunks are not repeated, and results do not depend on the engine.
 
     Args:
-        stack: holds `Free` where each texel has a number of its own, or with `same_for_all_texels=True` all have one in
-            common, which is held from then on: errors of the others are conditional on it.
+        stack: a stack with `Free` in the place of each number that is fitted. With `same_for_all_texels=True` it is
+            common to all texels, and the errors of the others are conditional on it.
         geometry, values, sigma, mask: see `fits.maps.inputs.map_data`: arrays or files, values (..., N, C) in 1/sr.
         out: directory of the store, made here, or begun by an earlier call with the same arguments.
         noise: as in `fits.fit`, but independent; without a floor there is one for the whole map.

@@ -63,62 +63,61 @@ class SpatialPrior:
 
 @dataclass(frozen=True)
 class MapOptions:
-    """How a map is fitted: the model beyond stack and transport, the work, and the thresholds of flags and verdicts."""
+    """Options of a map: model beyond stack and transport, computation, and thresholds of flags and verdicts."""
 
     scale: float | Free | None = None
-    """A factor of all measurements, as in `fits.fit`."""
+    """Factor on all measurements, as in `fits.fit`."""
     objective: Objective = "likelihood"
-    """What is minimised, as in `fits.fit`."""
+    """Objective, as in `fits.fit`."""
     instrument: Instrument | None = None
-    """As in `fits.fit`; none where texels have directions of their own."""
+    """Instrument, as in `fits.fit`; not allowed where texels have directions of their own."""
 
     starts: int = 8
     """Starts of each of the first few pilot texels."""
     seed: int = 0
     """Random seed of these starts."""
     pilot_texels: int = 64
-    """Texels that are fitted first: starts, resolution and common parameters come from them."""
+    """Number of texels that are fitted first, from which starts, resolution and common parameters are determined."""
     chunk_size: int = 1024
-    """Texels that are fitted and written together."""
+    """Number of texels that are fitted and written together."""
     restarts: int = 3
-    """Further starts from which a texel that ended poorly is fitted again."""
+    """Number of further starts for a texel whose fit is poor."""
     emulator: bool | None = None
-    """Whether an exact transport is replaced by an emulator over the bounds, made once; None: where it holds, and the
-    map has `emulator_min_texels`."""
+    """Whether an emulator replaces an exact transport; with None it does where it is accurate and the map has
+    `emulator_min_texels`."""
     emulator_min_texels: int = 1_000
-    """Texels from which on an emulator is made where nothing is said of it."""
+    """Number of texels from which on an emulator is used by default."""
     emulator_max_solves: int = 30_000
-    """Solutions of the transport that an emulator may take."""
+    """Largest number of solutions of the transport for an emulator."""
     emulator_error: float = 0.1
     """Largest error of an emulator at new points, in standard deviations of the data."""
     spatial_prior: SpatialPrior | None = None
-    """Prior of neighbouring texels, beside the plain fit and after it, see `FittedMap.smoothed`; with another one the
-    map is smoothed anew, and nothing else fitted again."""
+    """Spatial prior, applied after the fit without it (`FittedMap.smoothed`). Changing it does not repeat that fit."""
     settled: float = 0.01
-    """A map is smooth where no texel moved farther in a round, in standard errors."""
+    """The smoothing has settled when no texel moves farther than this in a round, in standard errors."""
 
     poor_probability: float = 1e-6
-    """A chi-square that noise exceeds less often is poor, unless those of the pilot are as large."""
+    """A chi-square is poor if its probability under the noise is below this, unless those of the pilot are as large."""
     pilot_quantile: float = 0.9
-    """Quantile of the pilot's reduced chi-squares that counts as explained ..."""
+    """Quantile of the reduced chi-squares of the pilot that is taken as the expected one."""
     pilot_factor: float = 1.5
-    """... up to this multiple."""
+    """A chi-square up to this multiple of the expected one is not poor."""
 
     converged_share: float = 0.99
-    """Share of the fitted texels that must have converged in a map to be relied on."""
+    """Smallest share of converged texels in a reliable map."""
     flagged_share: float = 0.05
-    """Share of the fitted texels that may be at a bound, poor or unidentified in such a map."""
+    """Largest share of texels that are at a bound, poor or unidentified in a reliable map."""
     numerical_error: float = 0.1
-    """Of the model, in standard deviations of the data, that is small: a resolution that is chosen stays below it."""
+    """Largest numerical error of the model, in standard deviations of the data, if the resolution is chosen."""
     chi_square_sigmas: float = 3.0
-    """The median chi-square is no chance this many of a texel's standard deviations from 1."""
+    """The median chi-square differs from 1 significantly if by more than this many standard deviations of a texel."""
 
     processes: int = 1
-    """1: threads of this process, one a core; more: so many processes with one thread each."""
+    """Number of processes with one thread each; 1 means threads of this process, one per core."""
     force: bool = False
-    """Throw away a store of other arguments, and begin anew."""
+    """Replace a store of other arguments."""
     progress: Progress = silent
-    """Called with (stage, done, all, note): "pilot", "map" and so on; None: not."""
+    """Function that is called with (stage, done, all, note), or None; stages are "pilot", "map" and so on."""
 
     def __post_init__(self) -> None:
         for name, least in {"starts": 1, "seed": 0, "pilot_texels": 1, "chunk_size": 1, "restarts": 0, "processes": 1,

@@ -83,8 +83,8 @@ def blocks_of(shape: Sequence[int], chunk: Sequence[int]) -> Iterator[Block]:
 class FittedMap:
     """Parameters of every texel of a map, with errors and flags; arrays are read when they are accessed.
 
-    Of a store that still grows the parts that are not there have flags of 0; a later access reads again.
-    `map["values/base.albedo"]` is the array of zarr, to be read in parts.
+    Texels that are not fitted yet have flags of 0. `map["values/base.albedo"]` is the zarr array, which can be read in
+    parts.
 
     Attributes:
         path: of the store.
@@ -137,7 +137,7 @@ class FittedMap:
 
     @property
     def smoothing(self) -> dict[str, Any] | None:
-        """How the map was smoothed: its prior, rounds, largest moves, whether it settled; None if it was not."""
+        """Record of the spatial prior (prior, rounds, largest moves, whether it settled), or None without one."""
         about = self.about(SMOOTHED)
         return about["smoothing"] if about and about["finished"] else None
 
@@ -148,12 +148,12 @@ class FittedMap:
 
     @property
     def flags(self) -> NDArray[np.uint16]:
-        """The state of every texel, in bits (see `has`); 0: it is not there yet."""
+        """State of every texel as bits (see `has`), 0 for a texel that is not fitted yet."""
         return self.read("flags")
 
     @property
     def at_bound(self) -> NDArray[np.uint32]:
-        """Which parameters are at a bound: bit p for `names[p]`."""
+        """Parameters at a bound, as bit p for `names[p]`."""
         return self.read("at_bound")
 
     @property

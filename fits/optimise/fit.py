@@ -65,24 +65,26 @@ def fit(
     checkpoint: str | Path | None = None,
     screen: bool = False,
 ) -> Fit:
-    """Find the parameters of `stack` that explain `data` best, and how well the data determine them.
+    """Fit the free parameters of a stack to measurements, from several starts, with standard errors.
 
     Args:
-        stack: holds `Free` where a number is to be fitted; or a `Problem` or `Joint`, in which all else is said.
-        data: only the samples that its mask leaves in are used.
-        transport: see `Problem`. A resolution that is not given is chosen: coarse for the starts, at the end so fine
-            that the numerical error of the model stays below a tenth of the data's standard deviation, where that is
-            within reach. `Fit.problem` has it.
+        stack: a stack with `Free` in the place of each number that is fitted; or a `Problem` or `Joint`, without
+            further arguments about data and model.
+        data: measurements; masked ones are not used.
+        transport: see `Problem`. A resolution that is not given is chosen: a coarse one for the starts, then one for
+            which the numerical error of the model is below a tenth of the standard deviations of the data
+            (`Fit.resolution`).
         noise, scale, objective, instrument: see `Problem`.
-        starts: at least 1: the `Free.start` values, then scrambled Sobol points of the box (in the logarithm for
-            parameters with a `LogNormal` or `LogUniform` prior), drawn with `seed`. The lowest end of all is the fit;
-            where a parameter ends on a bound, L-BFGS-B checks it.
+        starts: at least 1: the `Free.start` values, then scrambled Sobol points between the bounds (of the logarithm
+            for `LogNormal` and `LogUniform` priors). The best minimum is the result; where a parameter ends at a bound,
+            L-BFGS-B checks it.
+        seed: random seed of the starts.
         options: tolerances and thresholds.
         progress: called with ("fit", starts done, starts, note).
-        checkpoint: a file that each start is kept in as it ends: a fit that was killed takes those that are there for
-            done. It stays, as does one beside it for a second fit; one of another problem is replaced.
-        screen: stay at the resolution of the starts, do not estimate its error, continue only the starts that are
-            lowest after a few steps, and stop near the minimum: enough to rank stacks.
+        checkpoint: file in which each finished start is stored. A fit that was killed resumes from it; a file of
+            another problem is replaced.
+        screen: a rough fit to rank stacks: at the resolution of the starts, without an estimate of its error, and only
+            the best starts after a few steps are continued.
 
     Raises:
         ValueError: as `Problem`; starts < 1.

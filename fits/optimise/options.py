@@ -10,19 +10,20 @@ from layerjax._checks import require_number
 
 @dataclass(frozen=True)
 class FitOptions:
-    """What decides when a fit has converged and what is said of it; stored with the fit (`Fit.settings`).
+    """Tolerances and thresholds of a fit; they are stored with it (`Fit.settings`).
 
     Attributes:
-        same_values, same_errors: two starts converged to one minimum if no parameter differs by more than this share of
-            its box plus this many standard errors (each counted up to a twentieth of the box).
-        same_cost: and if their costs agree within this, in the log-posterior, times the reduced chi-square above 1.
-        equivalent_cost: minima explain the data equally well if their log-posteriors differ by less than this, times
-            the reduced chi-square above 1.
-        autocorrelation, autocorrelation_errors: a fit with independent noise is fitted again with model discrepancy if
-            residuals of neighbours along the scans are correlated by more than the first, and by more than so many
-            standard errors of that (see `Noise.discrepancy`).
-        numerical_error: of the model, in standard deviations of the data: a resolution that is chosen stays below it,
-            where that is within reach.
+        same_values: two starts reached the same minimum if no parameter differs by more than this share of the range
+            between its bounds, plus `same_errors` standard errors.
+        same_errors: standard errors in `same_values`, in total at most a twentieth of the range.
+        same_cost: largest difference of their log-posteriors, times the reduced chi-square if that is above 1.
+        equivalent_cost: minima are equivalent if their log-posteriors differ by less than this, times the reduced
+            chi-square if that is above 1.
+        autocorrelation: a model discrepancy is added if residuals of neighbours along the scans are correlated by more
+            than this and by more than `autocorrelation_errors` standard errors (see `Noise.discrepancy`).
+        autocorrelation_errors: see `autocorrelation`.
+        numerical_error: largest numerical error of the model, in standard deviations of the data, if the resolution is
+            chosen.
     """
 
     same_values: float = 1e-3

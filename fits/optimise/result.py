@@ -52,32 +52,32 @@ class WithoutDiscrepancy:
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """The best minimum of a `Problem` with P parameters, N used samples and C channels.
+    """Result of a fit: the best minimum of a `Problem` with P parameters, N measurements and C channels.
 
     Attributes:
-        problem: what was fitted to what.
+        problem: the fitting problem: stack, data, transport, noise and instrument.
         vector: (P,), best values in the problem's order, in physical units.
-        errors: (P,), standard errors, NaN for a parameter at a bound, infinite where the data do not identify it; those
-            of the others hold with the parameters in `at_bound` kept there.
+        errors: (P,), standard errors; NaN for a parameter at a bound, infinite for an unidentified one. The others are
+            conditional on the parameters at a bound being fixed there.
         covariance: (P, P), of the parameters.
         cost: half the sum of squared residuals.
-        at_bound: names of the parameters that ended on a bound.
-        converged: whether the best start did.
-        iterations: steps of the solver to the best minimum.
-        condition_number: of the information about the parameters, each scaled to unit length.
-        unidentified: the directions in the space of parameters that the data alone do not identify, worst first.
-        minima: the minima that starts reached, best first. `errors` and `covariance` are of the best alone;
-            `fits.sample`, `fits.predict` and `fits.evidence` count all that hold a share of the posterior.
-        insensitive: names of the parameters that the data say nothing about.
+        at_bound: names of the parameters at a bound.
+        converged: whether the best start converged.
+        iterations: steps of the optimiser to the best minimum.
+        condition_number: condition number of the information matrix, with each parameter scaled to unit length.
+        unidentified: directions of parameter space that the data do not identify, the worst first.
+        minima: local minima that were reached, the best first. `errors` and `covariance` are those of the best;
+            `fits.sample`, `fits.predict` and `fits.evidence` include all with a share of the posterior.
+        insensitive: names of the parameters that have no effect on the predicted data.
         settings: starts, seed, and the numbers of `FitOptions`.
-        start_outcomes: how many starts ended where: "best minimum", "local minima", "maximum steps reached", "failed".
-        numerical_error: of the model at the best values, in standard deviations of the data (for a named objective, of
-            the residuals): the largest difference from a finer resolution, or where that is out of reach from a coarser
-            one, which is more; that of the rays for an instrument's cones is added. None where there is neither.
-        resolution: of the transport, and the rays for cones, in words; None where there is neither. `problem` holds it.
-        without_discrepancy: the fit without model discrepancy, if residuals showed that one is needed (see `Noise`).
-        without_discrepancy_parts: of a `Joint`, the same by the names of measurements.
-        dataset: of one measurement of a `Joint`, its name there.
+        start_outcomes: number of starts by outcome: "best minimum", "local minima", "maximum steps reached", "failed".
+        numerical_error: largest numerical error of the model at the best values, in standard deviations of the data (of
+            the residuals for a named objective), estimated with a finer resolution, or with a coarser one where a finer
+            one is not possible, plus that of the rays of an instrument. None for a model without one.
+        resolution: resolution of the transport, and number of rays, as text; None where there is neither.
+        without_discrepancy: the fit without model discrepancy, if one was added because of the residuals (see `Noise`).
+        without_discrepancy_parts: the same for each data set of a `Joint`, by name.
+        dataset: name of the data set, if this is the part of a joint fit.
     """
 
     problem: Problem
@@ -109,10 +109,10 @@ class Fit:
         return str(shown_by("fits.reports.html:fit_fragment", self))
 
     def part(self, name: str = "") -> "Fit":
-        """What the fit of a `Joint` says of one measurement, with errors that all of them leave it; itself, if alone.
+        """The result for one data set of a `Joint`, with the errors of the joint fit; a fit of one data set itself.
 
-        It predicts by the normal approximation of what all measurements say; `Posterior.part` by their draws.
-        ValueError for a name that no measurement has.
+        It predicts in the normal approximation of the joint posterior, `Posterior.part` from its draws. ValueError for
+        an unknown name.
         """
         own = list(self.problem.places(name))
         problem = self.problem.problems[name]
@@ -143,13 +143,13 @@ class Fit:
         return found
 
     def require_one(self, what: str) -> None:
-        """ValueError, for `what` shows or keeps one measurement, of a fit of several."""
+        """Raise a ValueError if this is a joint fit; `what` is the function that needs one data set."""
         problems = self.problem.problems
         if problems.get("") is not self.problem:
             raise ValueError(f"{what}: of a joint fit it takes a part: fit.part(...) of {', '.join(problems)}")
 
     def require_posterior(self, what: str) -> None:
-        """ValueError, for `what` asks for the posterior anew, of a named objective, or of a part of a joint fit."""
+        """Raise a ValueError if the fit has no posterior of its own: a named objective, or a part of a joint fit."""
         if not self.is_posterior:
             raise ValueError(f"{what}: a fit of {self.problem.objective!r} has no noise model, and so no posterior")
         if self.dataset is not None:
@@ -209,7 +209,7 @@ class Fit:
 
     @cached_property
     def residuals(self) -> Floats:
-        """(N, C): (datum - model) / sigma, or datum minus model in the named objective's own measure.
+        """(datum - model) / sigma, (N, C), or the difference in the measure of the named objective.
 
         With correlated noise these are whitened: K^-1/2 times the differences, with K their covariance. Under the
         assumed model they are independent standard normal; `chi_square` is the sum of their squares.

@@ -29,12 +29,13 @@ MEMBER, OWED = 0.01, 0.25  # weight from which it does so if it owes the directi
 
 @dataclass(frozen=True)
 class Direction:
-    """A direction in the space of parameters that the data do not identify: only its members' other combinations are.
+    """A direction in parameter space that the data do not identify.
 
     Attributes:
-        error: standard error along the direction from the data alone, in boxes; infinite where they say nothing.
-        weights: of its members by name, in units of their boxes, largest first; their squares add up to about 1.
-        conditional_errors: of each member, with all other parameters known, in physical units.
+        error: standard error along the direction from the data alone, in units of the range between the bounds;
+            infinite if the data do not constrain it.
+        weights: weights of its parameters by name, in the same units, the largest first; their squares sum to about 1.
+        conditional_errors: standard error of each parameter when all others are fixed, in physical units.
     """
 
     error: float
@@ -42,11 +43,11 @@ class Direction:
     conditional_errors: dict[str, float]
 
     def error_of(self, name: str) -> float:
-        """Standard error that one parameter has along it, in boxes; 0 where it is no member."""
+        """Standard error of one parameter along the direction, in units of its range; 0 if it has no weight."""
         return abs(self.weights[name]) * self.error if name in self.weights else 0.0
 
     def renamed(self, names: Mapping[str, str]) -> "Direction":
-        """The same direction with those of its members that have other names, under these."""
+        """The same direction with parameters renamed."""
         members = {names[name]: name for name in self.weights if name in names}
         weights = {new: self.weights[name] for new, name in members.items()}
         errors = {new: self.conditional_errors[name] for new, name in members.items()}
@@ -54,7 +55,7 @@ class Direction:
 
     @property
     def unconstrained(self) -> bool:
-        """Whether one standard error along it crosses the whole box: only bounds and priors decide there."""
+        """Whether the standard error exceeds the range between the bounds of the parameters (prior-dominated)."""
         return self.error > UNCONSTRAINED_BEYOND
 
 

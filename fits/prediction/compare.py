@@ -155,7 +155,7 @@ def _notes(rows: list[ComparedFit], options: ComparisonOptions) -> list[str]:
         with_it = [row.name for row in rows if row.fit.problem.noise.discrepancy]
         others = {repr(replace(row.fit.problem.noise, discrepancy=None)) for row in rows}
         if what == "noise" and len(others) == 1 and 0 < len(with_it) < len(rows):
-            notes.append(f"of the fits only {', '.join(with_it)} with a discrepancy term")
+            notes.append(f"a model discrepancy is included in {', '.join(with_it)} only")
         else:
             notes.append(f"the fits differ in {what}: " + "; ".join(f"{name}: {one}" for name, one in settings.items()))
     if failed := [row.name for row in rows if not row.fit.converged]:

@@ -152,13 +152,16 @@ def without(problem: Problem, held_out: ArrayLike) -> Problem:
 
 @dataclass(frozen=True)
 class ModelScore:
-    """How well one of several stacks predicts held-out data, and how probable it is.
+    """Predictive score of one of several stacks.
 
-    elpd: sum of log predictive densities of measurements, each by a fit without its incidence. elpd_diff: how far it is
-    below the best; dse: standard error of the difference, by the incidences and by the draws of the posterior.
-    clear_diff: the difference less its error, or all of it where every group of held-out data decides (see
-    `ComparisonOptions`). weight: of stacking (Yao, Vehtari, Simpson & Gelman 2018, Bayesian Anal. 13, 917).
-    model_probability: of this stack among those compared, equally probable a priori.
+    Attributes:
+        elpd: sum of log predictive densities of measurements, each by a fit without its incidence.
+        elpd_diff: difference to the best stack.
+        dse: standard error of the difference, from the incidences and from the draws of the posterior.
+        clear_diff: the difference less its error, or all of it where every group of held-out data decides (see
+            `ComparisonOptions`).
+        weight: stacking weight (Yao, Vehtari, Simpson & Gelman 2018, Bayesian Anal. 13, 917).
+        model_probability: posterior probability among the compared stacks, which are equally probable a priori.
     """
 
     elpd: float

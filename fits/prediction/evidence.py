@@ -16,8 +16,13 @@ DRAWS = 1000  # before more are added where weights are uneven
 
 @dataclass(frozen=True)
 class Evidence:
-    """log_evidence: natural logarithm, with data in 1/sr. error: its standard error. pareto_k: of the importance
-    weights: above 0.7 the approximation misses a part of the posterior, and the error is too small."""
+    """Marginal likelihood of a stack.
+
+    Attributes:
+        log_evidence: its natural logarithm, with data in 1/sr.
+        error: standard error of the logarithm.
+        pareto_k: Pareto k of the importance weights; above 0.7 the error is unreliable.
+    """
 
     log_evidence: float
     error: float

@@ -61,15 +61,16 @@ class Prediction:
     """Predicted BSDF at M pairs of directions in C channels.
 
     Attributes:
-        wi, wo: directions, (M, 3).
+        wi: directions of the light, (M, 3).
+        wo: directions of the viewer, (M, 3).
         channels: C names.
-        values: the stack's own value for each of D draws of the posterior, (D, M, C), in 1/sr.
-        means, scales: location and scale of a measurement for each draw, (D, M, C), in 1/sr; with a discrepancy, of its
-            `logarithm`.
+        values: the value of the stack for each of D draws of the posterior, (D, M, C), in 1/sr.
+        means: location of a measurement for each draw, (D, M, C), in 1/sr; with a discrepancy, of its `logarithm`.
+        scales: its scale.
         softness: of that logarithm, (M, C) or (D, M, C), in 1/sr; None where values themselves are meant.
         discrepancy_sd: standard deviation of the discrepancy about `means`, (D, M, C), of the logarithm; None without.
         degrees_of_freedom: of Student's t; infinite for a Gaussian.
-        seed: of the draws that `bsdf` and `predictive` summarise.
+        seed: random seed of the draws that `bsdf` and `predictive` summarise.
         pareto_k: Pareto k of the importance weights that the draws of a fit's posterior are resampled by (see
             `fits.evidence`); NaN for draws of a chain.
         effective_draws: effective sample size of the D draws of the posterior.
@@ -102,17 +103,17 @@ class Prediction:
 
     @cached_property
     def latent(self) -> Summary:
-        """The stack alone, without the discrepancy."""
+        """Summary of the stack without model discrepancy."""
         return self._summary(self.values)
 
     @property
     def bsdf(self) -> Summary:
-        """The BSDF: the stack's value with the model discrepancy. This is the best estimate."""
+        """Summary of the BSDF, which is the stack with its model discrepancy (the best estimate)."""
         return self._summaries[0]
 
     @property
     def predictive(self) -> Summary:
-        """A new measurement: the BSDF with noise (posterior predictive)."""
+        """Summary of a new measurement, the BSDF with noise (posterior predictive)."""
         return self._summaries[1]
 
     @cached_property
@@ -203,9 +204,13 @@ class Prediction:
 class Scores:
     """Scores of predicted measurements.
 
-    count: measurements times channels. median_error, p95_error: median and 95th percentile of
-    |prediction / measurement - 1|, by the median prediction. model_error: the median of it by the stack's own value.
-    coverage: share of measurements in the central 50 % and 95 % intervals. elpd: mean log predictive density of one.
+    Attributes:
+        count: measurements times channels.
+        median_error: median of |prediction / measurement - 1|, for the median prediction.
+        p95_error: its 95th percentile.
+        model_error: its median for the stack without model discrepancy.
+        coverage: share of measurements in the central 50 % and 95 % intervals.
+        elpd: mean log predictive density of a measurement.
     """
 
     count: int
@@ -362,7 +367,7 @@ def _resampled_size(draws: int, pool: float) -> float:
 
 
 def with_discrepancy(fit: Fit, wi: Floats, wo: Floats, values: Floats) -> Floats:
-    """The BSDF of the best fit along other directions, (M, 3) each, where the stack alone has these values, (M, C)."""
+    """The BSDF of the best fit along other directions, (M, 3) each, given the stack's values there, (M, C)."""
     if fit.problem.model.process is None:
         return values
     _, floor = (np.asarray(part, float) for part in fit.problem.call(_noise_levels, fit.vector[None]))

@@ -71,11 +71,14 @@ RANGES = {"amplitude": (1e-6, 1.0), "grazing_exponent": (0.0, 2.0), "channel_cor
 class Discrepancy:
     """Model discrepancy: a Gaussian process of the logarithm of the BSDF (Kennedy & O'Hagan 2001).
 
-    amplitude: its standard deviation where light and viewer are along the normal, unitless, in [1e-6, 1]. length_half,
-    length_difference: length scales of its Matern kernel, in degrees in [0.1, 360], in the angle of the half vector to
-    the normal, and in that of light and viewer to the half vector. grazing_exponent: the standard deviation is that of
-    the normal times (2 / (cos i + cos o)) to this power, in [0, 2]. channel_correlation: of two channels, in [0, 1].
-    Each a number, `Free`, or None for a free one with a wide prior.
+    Each parameter is a number, `Free`, or None for a free one with a wide prior. The kernel is a Matern kernel.
+
+    Args:
+        amplitude: standard deviation where light and viewer are along the normal, unitless, in [1e-6, 1].
+        length_half: length scale in the half angle, in degrees in [0.1, 360].
+        length_difference: length scale in the difference angle, in degrees in [0.1, 360].
+        grazing_exponent: power of 2 / (cos i + cos o), by which the standard deviation increases, in [0, 2].
+        channel_correlation: correlation of two channels, in [0, 1].
     """
 
     amplitude: float | Free | None = None

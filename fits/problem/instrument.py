@@ -29,17 +29,20 @@ GAIN_SPREADS, GAINS_END = (1e-4, 1.0), 6.0  # relative standard deviations of ga
 
 @dataclass(frozen=True)
 class Instrument:
-    """An instrument by which measurements were taken. Angles in degrees.
+    """How an instrument maps the BSDF to measurements. Angles are in degrees.
 
-    source_aperture, detector_aperture: full angles of the cones, in [0, 30]; a measurement is the mean over them, which
-    costs four times as much where a lobe may be narrow, more where one is narrower than the cones.
-    tilt: of the sample's normal towards the mirror side of the plane of incidence, in [-10, 10], or `Free`; None: 0.
-    gain_sd: relative standard deviation, in [1e-4, 1], of a factor of its own that every polar angle of the
-    light has, at all azimuths, beside the common scale, with a log-normal prior about 1 that they share; None: none.
-    floor: of the noise, in 1/sr: as `Noise.floor`, in whose place it stands.
-    rings: of rays that stand for a cone where a lobe is narrowest, at most, in [1, 8]; n of them keep the error below a
-    thousandth of the peak where the cones together are as wide as 0.64 n - 0.25 lobes at half maximum (two cones: a
-    sixth less, and at most 4). None: as many as the narrowest lobe within the bounds, or that a fit finds, asks for.
+    Args:
+        source_aperture: full angle of the cone of the source, in [0, 30]; a measurement is the mean over the cones.
+        detector_aperture: full angle of the cone of the detector, in [0, 30].
+        tilt: tilt of the sample's normal towards the mirror side of the plane of incidence, in [-10, 10], or `Free`;
+            None is 0.
+        gain_sd: relative standard deviation, in [1e-4, 1], of one factor per polar angle of the light, with a
+            log-normal prior about 1; None is no such factor.
+        floor: noise floor in 1/sr, in place of `Noise.floor`.
+        rings: largest number of rings of rays for a cone, in [1, 8]. n rings have an error below a thousandth of the
+            peak where the cones together are as wide as 0.64 n - 0.25 lobes at half maximum (with two cones a sixth
+            less, and at most 4 rings). None: as many as the narrowest lobe within the bounds, or that of the fit,
+            needs.
     """
 
     source_aperture: float = 0.0

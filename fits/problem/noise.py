@@ -38,19 +38,23 @@ DEGREES_OF_FREEDOM = (0.01, 1e6)  # above, a Student-t is a Gaussian, and the te
 
 @dataclass(frozen=True)
 class Noise:
-    """How a datum scatters about the model: variance = sigma^2 + (relative f)^2 + floor^2, with f the model's value.
+    """Noise model: variance = sigma^2 + (relative f)^2 + floor^2, with the predicted BSDF f.
 
-    relative: a share of f, in [0, 1] (0.05 is 5 %), or `Free`.
-    floor: 1/sr, 0 or in [1e-100, 1e100], or `Free` with low > 0.
-    use_sigma: take the measurement's own sigma where it has one.
-    tails: "gaussian", or "student" with `degrees_of_freedom` in [0.01, 1e6], of scale (not standard deviation) sigma.
-    discrepancy: model discrepancy beside that: `Discrepancy`, or True for one whose numbers are all free; only with
-    Gaussian tails. False: none. None leaves it to the residuals: a stack is fitted without; where residuals of
-    neighbours along a scan are correlated by more than 0.2 and 3 standard errors, it is fitted again with it, and the
-    fit keeps both (`Fit.without_discrepancy`). A `Problem` by itself has none then.
-    By default `relative` is 0 if the measurement's sigma is used or `floor` is given, else 0.05; with relative noise
-    `floor` becomes 1e-4 of the median |value|, without it 0. Relative noise refers to the model, not to the datum,
-    because weights taken from noisy data bias the fit downwards by twice the relative variance.
+    Relative noise refers to the prediction, because weights from noisy data bias the fit downwards by twice the
+    relative variance.
+
+    Args:
+        relative: relative standard deviation, in [0, 1] (0.05 is 5 %), or `Free`. None: 0 if the data's sigma is used
+            or `floor` is given, else 0.05.
+        floor: in 1/sr, 0 or in [1e-100, 1e100], or `Free` with low > 0. None: 1e-4 of the median |value| with relative
+            noise, else 0.
+        use_sigma: whether the data's own sigma is used, where there is one.
+        tails: "gaussian"; or "student", for which sigma is the scale, not the standard deviation.
+        degrees_of_freedom: of Student's t, in [0.01, 1e6].
+        discrepancy: a `Discrepancy`; True for one with free parameters; False for none. With None, a fit is first made
+            with independent noise. If residuals of neighbours along a scan are correlated by more than 0.2 and by more
+            than 3 standard errors, it is repeated with a discrepancy (`Fit.without_discrepancy` is the first); a
+            `Problem` by itself then has none. Requires Gaussian tails.
     """
 
     relative: float | Free | None = None

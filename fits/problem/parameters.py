@@ -137,16 +137,20 @@ def _random_walk_normaliser(prior: Prior, steps: Floats, normalisers: Floats) ->
 
 @dataclass(frozen=True)
 class Free:
-    """A number to be fitted: a placeholder that may stand anywhere in a stack where a number may stand.
+    """A free parameter: a placeholder for a number anywhere in a stack.
 
-    `start`, `low`, `high` are numbers or one per channel (then a prior holds for each channel); the unit is that
-    of the number it stands for. Requires low < high, start in [low, high], and low > 0 for `LogNormal` and
-    `LogUniform`. Each place is a parameter of its own, even where the same object stands twice.
+    Each place is a parameter of its own, even where the same object is used twice.
 
-    `random_walk_sd` holds channels together: the standard deviation of the difference between neighbours (of the
-    logarithms for `LogNormal` and `LogUniform`), one or one for each of the C - 1 steps, say in proportion to the root
-    of the distance in wavelength. It is a Gaussian random walk beside the prior of each channel, not cut off at bounds.
-    `same_for_all_texels`: all texels of a map have this number in common, see `fits.fit_map`.
+    Args:
+        start: first start of the optimiser, in [low, high]; a number or one per channel, in the unit of the number that
+            it replaces.
+        low: lower bound; above 0 for `LogNormal` and `LogUniform`.
+        high: upper bound, above `low`.
+        prior: `Uniform` (the default), `LogUniform`, `Normal` or `LogNormal`; of each channel, if there are several.
+        random_walk_sd: standard deviation of the difference between neighbouring channels (of the logarithm for
+            `LogNormal` and `LogUniform`), one or one for each of the C - 1 steps. It adds a Gaussian random walk to the
+            prior, which is not truncated at the bounds.
+        same_for_all_texels: whether the parameter is common to all texels of a map (`fits.fit_map`).
     """
 
     start: float | Sequence[float]
@@ -228,13 +232,17 @@ def require_number_or_free(name: str, value: Any, low: float, high: float) -> No
 
 
 class PowerLaw(Shown):
-    """A number a channel, ``amplitude (wavelength / reference)^-exponent``: in the place of one in a stack.
+    """A parameter per channel that follows a power law: ``amplitude (wavelength / reference)^-exponent``.
 
-    amplitude: the number at the reference, in its unit, or `Free` with low >= 0. exponent: unitless, or `Free`; of
-    reduced scattering 0.5 to 4 are common. wavelengths: one a channel, in nm. reference: in nm; None: geometric mean.
+    Args:
+        amplitude: value at the reference, in the unit of the parameter, or `Free` with low >= 0.
+        exponent: unitless, or `Free`; 0.5 to 4 are common for reduced scattering.
+        wavelengths: one per channel, in nm.
+        reference: wavelength in nm; None: the geometric mean.
 
     Raises:
-        ValueError: nothing is free, a number a channel, fewer than two wavelengths, or one that is not above 0.
+        ValueError: nothing is free, a parameter differs by channel, or there are fewer than two wavelengths or one that
+            is not above 0.
     """
 
     amplitude: Any

@@ -191,23 +191,22 @@ class FittingProblem(abc.ABC):
 
 @dataclass(frozen=True, eq=False)
 class Problem(FittingProblem):
-    """A stack with `Free` leaves, the measurements that it should explain, and how they scatter about it.
+    """A fitting problem: a stack with `Free` parameters, measurements, transport, noise model and instrument.
 
     Args:
-        stack: holds `Free` where a number is to be fitted.
-        data: only its used samples enter: values of a BSDF, or `Totals`, shares of light (in what follows, in the place
-            of a BSDF in 1/sr).
-        transport: a layerjax transport that is not random, "auto" (see `layerjax.prepare`), or any callable
-            (stack, wi, wo) -> values, of unit directions (N, 3) and a BSDF (N, C) in 1/sr; the stack may then be any
-            pytree. A resolution that is not given is what is known while tracing asks for, and for a fit see `fit`.
-        noise: how a datum scatters about the model.
-        scale: a unitless factor common to all values: a number above 0, `Free`, or None for 1.
+        stack: a stack with `Free` in the place of each number that is fitted.
+        data: `Measurements`, or `Totals`, whose shares of light then take the place of a BSDF; masked ones are not
+            used.
+        transport: a deterministic transport, "auto" (see `layerjax.prepare`), or any function (stack, wi, wo) ->
+            values, of unit directions (N, 3) and a BSDF (N, C) in 1/sr; the stack may then be any pytree.
+        noise: the noise model, see `Noise`.
+        scale: a factor common to all values: a number above 0, `Free`, or None for 1.
         objective: "likelihood", or a named residual: "cosine_l2", "log1p_cos" or "cube_root".
-        instrument: by which the measurements were taken; None: exact directions, one scale.
+        instrument: see `Instrument`; None: exact directions.
 
     Raises:
-        ValueError: no parameter is free or no sample used, channels do not match, the noise can vanish, the transport
-            cannot carry the stack, or a named objective stands beside free noise levels, priors or
+        ValueError: no parameter is free, no measurement is used, channels do not match, the noise can vanish, the
+            transport does not support the stack, or a named objective is combined with free noise levels, priors or
             `Free.random_walk_sd`.
     """
 
@@ -232,22 +231,22 @@ class Problem(FittingProblem):
 
     @property
     def common_names(self) -> tuple[str, ...]:
-        """Names of the parameters that are the same for all texels of a map, one a channel where numbers are."""
+        """Names of the parameters that are common to all texels of a map."""
         return names_of({name: one for name, one in self._assembled.free.items() if one.same_for_all_texels})
 
     @property
     def noise_is_assumed(self) -> bool:
-        """Whether neither the data nor `noise` nor the instrument say how large the noise is: see `Noise`."""
+        """Whether the noise level is assumed, since neither data, `noise` nor instrument specify it (see `Noise`)."""
         return is_assumed(with_floor(self.noise, self.instrument), self.data)
 
     @property
     def problems(self) -> "dict[str, Problem]":
-        """The one measurement."""
+        """The problem itself, as the only data set."""
         return {"": self}
 
     @cached_property
     def without_discrepancy(self) -> "Problem":
-        """The problem with independent noise, whose parameters are the first of this one; it predicts the same."""
+        """The problem with independent noise, whose parameters are the first of this one."""
         if not self.noise.discrepancy:
             return self
         other, own = replace(self, noise=replace(self.noise, discrepancy=False)), self.model
@@ -255,7 +254,7 @@ class Problem(FittingProblem):
         return other.with_model(replace(other.model, **same))
 
     def with_problems(self, changed: "Mapping[str, Problem]") -> "Problem":
-        """What stands in its place."""
+        """The problem that replaces this one."""
         return changed.get("", self)
 
     def predict_at(self, vectors: ArrayLike, wi: ArrayLike, wo: ArrayLike) -> Array:
@@ -265,7 +264,7 @@ class Problem(FittingProblem):
         return other.call(predict_each, vectors)
 
     def with_other_rays(self) -> "Problem":
-        """The problem with other numbers of rays for the cones of its instrument: what differs is their error."""
+        """The problem with other numbers of rays for the apertures, to estimate their error."""
         used = self.data.used()
         return self.with_model(replace(self.model, **_directions(self, used.wi, used.wo, other_rays=True)))
 

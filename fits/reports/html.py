@@ -78,7 +78,9 @@ class FitReport:
             compared.append(_picture(pictures.maps_picture(fit), caption))
         if self.held_out is not None and self.predicted is not None:
             compared.append(tables.scores_table(self.predicted, self.held_out, "Held-out data"))
-            caption = "Held-out data in the plane of incidence, and their prediction; sigma: that of the prediction."
+            caption = (
+                "Held-out data in the plane of incidence and their prediction; residuals by its standard deviation."
+            )
             compared.append(_picture(pictures.prediction_picture(self.predicted, self.held_out), caption))
 
         # what the data identify
@@ -97,7 +99,7 @@ class FitReport:
             if self.estimates is not None:
                 corner = pictures.corner_picture(self.estimates)
                 sampling.append(tables.posterior_table(self.estimates))
-                sampling.append(_picture(corner, "Samples of the posterior; orange: the best fit."))
+                sampling.append(_picture(corner, "Draws from the posterior; orange: the best fit."))
 
         residuals = [one.sentence for one in verdicts.statements(facts)["residuals"]]
         residuals.append(f"Fit: {fit.status}.")

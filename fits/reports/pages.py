@@ -45,6 +45,7 @@ figure { margin: 1rem 0; } img { max-width: 100%; } figcaption, .note { font-siz
 pre { background: #f6f6f6; padding: 0.8rem; font-size: 12.5px; overflow-x: auto; }
 .verdict { background: #fff6e5; border-left: 4px solid #E69F00; padding: 0.5rem 1rem; }
 .verdict.fine { background: #eef7f2; border-color: #009E73; }
+@media (max-width: 40rem) { figure { overflow-x: auto; } figure img { max-width: 44rem; } }
 </style></head><body>
 $body
 </body></html>

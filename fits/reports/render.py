@@ -44,9 +44,9 @@ def render(
     three channels the picture is in colour (red, green, blue), else grey by their mean.
 
     Args:
-        stack: the material; every parameter a number.
+        stack: the material, without free parameters.
         transport: see `layerjax.prepare`; None: `AddingDoubling`, all orders of scattering.
-        title: what stands above it.
+        title: title of the picture.
         size: pixels of a sphere's diameter, in [16, 1024].
 
     Raises:

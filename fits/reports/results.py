@@ -43,11 +43,11 @@ _FIELDS = [one.name for one in fields(Fit) if one.name not in ("problem", "witho
 
 
 def save_fit(fit: Fit, directory: str | Path, force: bool = False) -> None:
-    """Writes a result directory, without report, whole or not at all.
+    """Write a result directory, without report. A directory that cannot be completed is not written.
 
     Args:
-        fit: what is saved.
-        directory: made if it is not there.
+        fit: the fit.
+        directory: is created if it does not exist.
         force: replace an earlier result.
 
     Raises:
@@ -93,7 +93,7 @@ def write_fit(fit: Fit, folder: Path, text: str | None = None) -> None:
 
 
 def load_fit(directory: str | Path) -> Fit:
-    """The fit that was saved in a directory.
+    """Load a fit from its directory.
 
     Raises:
         ValueError, FileNotFoundError: on one line, for a directory that holds none, a damaged one, or none at all.
@@ -152,9 +152,9 @@ def load_held_out(directory: str | Path) -> Measurements | None:
 
 
 def load_posterior(directory: str | Path) -> Posterior | None:
-    """The posterior that was sampled in a result directory, as far as it got; None before its first step.
+    """Load the posterior from a result directory, also while it is sampled; None before the first step.
 
-    Its estimates are refused where the chain is too short, unless it was saved as one to be reported all the same.
+    Estimates from a chain that has not converged are refused, unless it was sampled with `allow_unconverged`.
 
     Raises:
         FileNotFoundError: there is no such directory.

@@ -237,7 +237,7 @@ def scores_table(prediction: Prediction, data: Measurements, title: str) -> Tabl
 def prediction_csv(prediction: Prediction) -> str:
     """A row for each pair of directions and channel: angles in degrees, all else in 1/sr.
 
-    Columns `bsdf_...`: the stack with discrepancy; `predictive_...`: a new measurement; `latent_...`: the stack alone.
+    Columns `bsdf_...`: the stack with discrepancy; `latent_...`: without it; `predictive_...`: a new measurement.
     """
     out = io.StringIO()
     numbers: dict[str, np.ndarray] = {}

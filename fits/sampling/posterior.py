@@ -29,7 +29,7 @@ MODE_STEPS = 1000  # of a chain, by which shares of modes are estimated
 
 @dataclass(frozen=True)
 class Mode:
-    """A mode of a posterior: its share, the standard error of that as walkers scatter, the mean parameters by name."""
+    """A mode of a posterior: its share, the standard error of the share, and the mean parameters by name."""
 
     share: float
     error: float
@@ -38,20 +38,19 @@ class Mode:
 
 @dataclass(frozen=True, eq=False)
 class Posterior:
-    """Chains of P parameters, an ensemble of walkers or a few of NUTS, and what they say.
+    """Posterior of P parameters: chains of an ensemble of walkers (emcee) or of NUTS.
 
     Attributes:
-        chain: (steps, walkers, P), physical values, from the start on.
+        chain: (steps, walkers, P), in physical units, with the burn-in.
         log_probability: (steps, walkers), of the unconstrained coordinates, not normalised.
         autocorrelation_time: (P,), in steps, of the chain without its burn-in.
-        acceptance: mean share of proposals taken; of NUTS, of steps that moved.
-        converged: the chain is as long in autocorrelation times, and R-hat as near to 1, as `options` ask for.
-        allow_unconverged: estimates may be had from a chain that has not converged.
-        status: what is to be said of the sampler, if anything.
-        divergences: trajectories of NUTS, after its warm-up, whose energy diverged.
-        modes: the minima of the fit that hold a share of the posterior, the largest first, if there are several.
-            Estimates are of all of them together.
-        options: that it was sampled with.
+        acceptance: mean acceptance; for NUTS, the share of steps that moved.
+        converged: whether the chain meets the thresholds of `options`.
+        allow_unconverged: whether estimates are allowed from a chain that has not converged.
+        status: remarks of the sampler, if any.
+        divergences: number of divergences of NUTS after its warm-up.
+        modes: modes of the posterior, the largest first, if there are several. Estimates are of all of them together.
+        options: the options of the sampler.
     """
 
     fit: Fit
@@ -76,7 +75,7 @@ class Posterior:
         return str(shown_by("fits.reports.html:posterior_fragment", self))
 
     def part(self, name: str) -> "Posterior":
-        """What the posterior of a `Joint` says of one measurement. ValueError for a name that none has."""
+        """Posterior of one data set of a `Joint`. ValueError for an unknown name."""
         fit = self.fit.part(name)
         own = list(self.fit.problem.places(name))
         whole = {plain: self.names[place] for plain, place in zip(fit.problem.names, own, strict=True)}
@@ -92,12 +91,12 @@ class Posterior:
 
     @property
     def burn_in(self) -> int:
-        """Steps at the start that no estimate uses."""
+        """Number of steps at the start that estimates do not use."""
         return len(self.chain) - len(after_burn_in(self.chain, self.options))
 
     @property
     def thin(self) -> int:
-        """Every how many steps `samples` takes one: half the shortest autocorrelation time."""
+        """Steps between two draws of `samples`, half the shortest autocorrelation time."""
         shortest = float(np.min(self.autocorrelation_time))
         return max(1, int(shortest / 2)) if math.isfinite(shortest) else 1
 
@@ -108,7 +107,7 @@ class Posterior:
 
     @property
     def effective_samples(self) -> Floats:
-        """Effective sample size of each parameter, (P,): the smaller one of bulk and tail, by ArviZ."""
+        """Effective sample size of each parameter, (P,), the smaller of bulk and tail as ArviZ defines them."""
         return self.convergence.ess
 
     @property
@@ -135,11 +134,11 @@ class Posterior:
 
     @cached_property
     def inference_data(self) -> "InferenceData":
-        """ArviZ data: posterior, log_likelihood of each datum, posterior_predictive with noise, observed_data.
+        """ArviZ data with posterior, log_likelihood of each datum, posterior_predictive with noise, and observed_data.
 
         A walker is a chain. Draws are thinned so that about 2,000 remain: they serve predictions and model comparison.
         The discrepancy of simulated measurements is drawn anew, where `predict` has that of the data.
-        ValueError for a fit of several measurements: ask `part`.
+        ValueError for a joint fit; use `part`.
         """
         self.fit.require_one("inference_data")
         self._require_converged()

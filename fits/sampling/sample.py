@@ -49,16 +49,16 @@ def sample(
     """Sample the posterior of a fit until its chain has converged and has the effective samples that are requested.
 
     Args:
-        fit: made with a likelihood.
-        ess, walkers, max_steps: those of `options`, in their place.
+        fit: a fit of a likelihood.
+        ess, walkers, max_steps: in place of those of `options`.
         sampler: "emcee", an ensemble of walkers, or "nuts", a few chains that follow the gradient, for many parameters:
             it needs the extra `layerjax[nuts]`.
-        options: when sampling ends, and how; a chain may be gone on with for more effective samples.
+        options: stopping rule and settings. A chain can be resumed for more effective samples.
         seed: random seed; the same seed gives the same chain.
-        path: file that the chain is kept in as it grows: a killed run that is started again resumes, and ends as it
-            would have. One process at a time writes it, any number may read it. None keeps it in memory.
-        resume: False replaces what `path` holds.
-        allow_unconverged: let the result report estimates though the chain has not converged.
+        path: file of the chain, from which a killed run resumes with the same result. One process at a time may write
+            it. None: in memory.
+        resume: False replaces the chain of `path`.
+        allow_unconverged: allow estimates from a chain that has not converged.
         progress: called with ("sample", steps, steps that are expected in all, note); before that with
             ("approximation", rounds, most, note), and of NUTS with ("warm-up", steps, all).
 

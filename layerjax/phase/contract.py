@@ -23,12 +23,12 @@ class Flakes(NamedTuple):
 
 
 class PhaseFunction(Shown):
-    """Where a collision sends the light: p(wi, wo), which integrates to 1 over wo, and the extinction sigma(w).
+    """Base class of phase functions: p(wi, wo), which integrates to 1 over wo, and the extinction sigma(w).
 
-    Directions come as components that point away from the collision (see `layerjax.directions`): unscattered
-    light has wo = -wi. The kernel sigma(wi) p(wi, wo) must be symmetric in wi and wo, and the same for -wi and
-    -wo. `pdf` and `sample` are all that a class must add; where sigma is not 1, `cross_section` too, and where p is not
-    the same for all azimuths, `is_upright` and `mirrored`. All else is for speed, accuracy or further transports.
+    Directions are components that point away from the collision (see `layerjax.directions`): unscattered light has wo =
+    -wi. The kernel sigma(wi) p(wi, wo) must be symmetric in wi and wo, and the same for -wi and -wo. A subclass has to
+    define `pdf` and `sample`; also `cross_section` if sigma is not 1, and `is_upright` and `mirrored` if p depends on
+    azimuth. The other methods improve speed or accuracy, or are needed by further transports.
 
     Parameters are fields made by `layerjax._parameters.parameter`, which takes the range of a new one as `limits`.
     """
@@ -77,17 +77,17 @@ class PhaseFunction(Shown):
 
     @property
     def width(self) -> Parameter:
-        """About the angle, in radians and up to 1, within which p changes: what a grid of directions must resolve.
+        """Angle in radians, up to 1, over which p changes, and which a grid of directions has to resolve.
 
-        Forward peaks of what has `moments` do not count: what a grid does not resolve of them counts as ballistic.
+        Forward peaks of phase functions with `moments` are excluded, since the part that a grid misses is ballistic.
         """
         return 1.0
 
     @property
     def onward_width(self) -> Parameter:
-        """About the angle, in radians and up to 1, within which the ballistic part of a peak falls off.
+        """Angle in radians, up to 1, over which the ballistic part of a forward peak falls off.
 
-        It counts where one looks through the medium, beside `width`.
+        It matters for transmission through the medium, beside `width`.
         """
         return 1.0
 
@@ -114,7 +114,7 @@ class PhaseFunction(Shown):
 
     @property
     def flakes(self) -> Flakes | None:
-        """The normals, if light meets small mirrors; None: it does not."""
+        """Distribution of normals of specular flakes, or None."""
         return None
 
 

@@ -15,13 +15,16 @@ ASSUMED_FORWARD, ASSUMED_BACKWARD = 0.9, 0.75
 
 
 class HenyeyGreenstein(PhaseFunction):
-    """Henyey-Greenstein phase function (Henyey & Greenstein 1941).
+    """Phase function of Henyey & Greenstein 1941, by the deflection angle.
 
-    ========= ====== ================ ======= ============================================
-    parameter symbol range            default meaning
-    ========= ====== ================ ======= ============================================
-    g         g      [-0.999, 0.999]          mean cosine of deflection; > 0 scatters onward
-    ========= ====== ================ ======= ============================================
+    p = (1 - g^2) / (4 pi (1 + g^2 - 2 g cos)^1.5).
+
+    ========= ====== ===== ==== =============== ======== ============== ===========================================
+    parameter symbol shape unit range           default  differentiable meaning
+    ========= ====== ===== ==== =============== ======== ============== ===========================================
+    g         g      ()    1    [-0.999, 0.999] required yes            mean cosine of the deflection; above 0 most
+                                                                        light is scattered forward
+    ========= ====== ===== ==== =============== ======== ============== ===========================================
     """
 
     g: Parameter = parameter("HenyeyGreenstein.g")

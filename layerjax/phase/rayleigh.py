@@ -10,7 +10,7 @@ from layerjax.phase.contract import PhaseFunction, deflected
 
 
 class Rayleigh(PhaseFunction):
-    """p = 3 / (16 pi) (1 + cos^2) of the angle of deflection, as much forward as backward; without parameters."""
+    """Rayleigh scattering: p = 3 / (16 pi) (1 + cos^2), by the deflection angle; it has no parameters."""
 
     def kernel(self, wi: Vector, wo: Vector, h: Vector | None) -> Array:
         return self.pdf(wi, wo)

@@ -18,16 +18,20 @@ from layerjax.quadrature import Rule, flake_rule
 
 
 class SGGX(PhaseFunction):
-    """Flakes with an SGGX distribution of normals (Heitz et al. 2015; Wang 2022, Sec. 4), as small mirrors.
+    """Specular flakes with an SGGX distribution of normals (Heitz et al. 2015; Wang et al. 2022).
 
-    ========= ====== ===================== ======== ===========================================================
-    parameter symbol range                 default  meaning
-    ========= ====== ===================== ======== ===========================================================
-    kind             "surface" | "fiber"            normals along the axis (flakes) or across it (fibers)
-    alpha     alpha  [1e-4, 1]                      roughness; 1 is isotropic
-    axis      omega  any vector, not 0     None     symmetry axis, of any length; None is the normal z,
-                                                    and costs less than a given axis
-    ========= ====== ===================== ======== ===========================================================
+    p = D(h) / (4 sigma(wi)), with D(h) = 1 / (pi sqrt(det S) (h' S^-1 h)^2) and sigma(w) = sqrt(w' S w). Along the
+    axis and across it, S has the eigenvalues 1 and alpha^2 for surfaces, alpha^2 and 1 for fibers.
+
+    ========= ====== ===== ==== ================== ======== ============== =============================================
+    parameter symbol shape unit range              default  differentiable meaning
+    ========= ====== ===== ==== ================== ======== ============== =============================================
+    kind                        "surface", "fiber" required no             normals along the axis (flakes), or across it
+                                                                           (fibers)
+    alpha     alpha  ()    1    [1e-4, 1]          required yes            roughness; 1 is isotropic
+    axis      omega  (3,)  1    not 0              None     yes            symmetry axis, of any length; None: the
+                                                                           normal z, which takes less time
+    ========= ====== ===== ==== ================== ======== ============== =============================================
     """
 
     uses_half_vector: ClassVar[bool] = True

@@ -11,13 +11,13 @@ from layerjax.surfaces.contract import Surface
 
 
 class Lambertian(Surface):
-    """The same radiance in every direction: f = albedo / pi.
+    """Diffuse surface, with the same radiance in every direction: f = albedo / pi.
 
-    ========= ====== ======= ======= =======================================
-    parameter symbol range   default meaning
-    ========= ====== ======= ======= =======================================
-    albedo    rho    [0, 1]          reflected share, one or one per channel
-    ========= ====== ======= ======= =======================================
+    ========= ====== ======== ==== ====== ======== ============== ============================
+    parameter symbol shape    unit range  default  differentiable meaning
+    ========= ====== ======== ==== ====== ======== ============== ============================
+    albedo    rho    (), (C,) 1    [0, 1] required yes            reflected share of the light
+    ========= ====== ======== ==== ====== ======== ============== ============================
     """
 
     albedo: Parameter = parameter("Lambertian.albedo")

@@ -14,19 +14,19 @@ from layerjax.surfaces.contract import Surface
 
 
 class Conductor(Surface):
-    """Rough conductor.
+    """Rough conductor: f = F D G / (4 cos_i cos_o), with the Fresnel term F of the index n + i k (Walter et al. 2007).
 
-    ============ ====== ============ ======= ===============================================================
-    parameter    symbol range        default meaning
-    ============ ====== ============ ======= ===============================================================
-    ior          n      [0.01, 10]           real part of the index relative to what surrounds the stack, per
-                                             channel
-    k            k      [0, 20]              extinction coefficient, per channel
-    alpha        alpha  [1e-4, 1]            width of the normals; for ``"vmf"`` [1e-4, 15], with
-                                             kappa = 2 / alpha^2
-    distribution D      "ggx" or     "ggx"   of the normals: GGX, or von Mises-Fisher (see `Interface`)
-                        "vmf"
-    ============ ====== ============ ======= ===============================================================
+    ============ ====== ======== ==== ============ ======== ============== =============================================
+    parameter    symbol shape    unit range        default  differentiable meaning
+    ============ ====== ======== ==== ============ ======== ============== =============================================
+    ior          n      (), (C,) 1    [0.01, 10]   required yes            real part of the index, relative to the
+                                                                           surroundings of the stack
+    k            k      (), (C,) 1    [0, 20]      required yes            imaginary part of the index (extinction
+                                                                           coefficient), with the same reference
+    alpha        alpha  ()       1    [1e-4, 1]    required yes            width of D; [1e-4, 15] for ``"vmf"``, where
+                                                                           kappa = 2 / alpha^2
+    distribution D                    "ggx", "vmf" "ggx"    no             GGX or von Mises-Fisher, as of an `Interface`
+    ============ ====== ======== ==== ============ ======== ============== =============================================
     """
 
     ior: Parameter = parameter("Conductor.ior")

@@ -24,19 +24,21 @@ _MEAN = 2.0 / 3.0 - 28.0 / (15.0 * jnp.pi)
 
 
 class OrenNayar(Surface):
-    """Rough diffuse surface.
+    """Rough diffuse surface: V-shaped grooves of Lambertian facets.
 
-    ========= ======== =================== =================== ===========================================
-    parameter symbol   range               default             meaning
-    ========= ======== =================== =================== ===========================================
-    albedo    rho      [0, 1]                                  albedo of a facet, per channel
-    roughness r, sigma [0, 1]                                  "energy_preserving": the paper's r;
-                                                               "classic": slope deviation in radians
-    form               "energy_preserving" "energy_preserving" which of the two models
-                       | "classic"
-    ========= ======== =================== =================== ===========================================
+    ``form="energy_preserving"`` is the model of Portsmouth et al. 2025, ``form="classic"`` that of Oren & Nayar
+    1994, which loses energy.
 
-    Not smooth where the azimuths of wi and wo differ by pi/2, and (classic and Fujii) where theta_i = theta_o.
+    ========= ======== ======== ====== ====== =================== ============== =====================================
+    parameter symbol   shape    unit   range  default             differentiable meaning
+    ========= ======== ======== ====== ====== =================== ============== =====================================
+    albedo    rho      (), (C,) 1      [0, 1] required            yes            albedo of a facet
+    roughness r, sigma ()       1, rad [0, 1] required            yes            r of the paper; for "classic" the
+                                                                                 standard deviation of the slope angle
+    form                                      "energy_preserving" no             the model; or "classic"
+    ========= ======== ======== ====== ====== =================== ============== =====================================
+
+    Not smooth where the azimuths of wi and wo differ by pi/2, and where theta_i = theta_o.
     """
 
     albedo: Parameter = parameter("OrenNayar.albedo")

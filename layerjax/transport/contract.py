@@ -35,13 +35,13 @@ No power of 2: arrays of 2048 numbers get into each other's way in it, and gradi
 
 
 class Transport(eqx.Module):
-    """One way of solving a stack; its options are static fields.
+    """Base class of transports; options are static fields.
 
-    Directions come as components, already broadcast against each other; results are one array a channel. `state` is
-    what `prepare` returned: a pytree of arrays that holds all that no direction is needed for.
+    Directions are components that are broadcast against each other; results are one array per channel. `state` is what
+    `prepare` returned: a pytree of arrays with everything that does not depend on direction.
 
-    Three functions take whole batches instead, arrays ``(..., 3)``, and a `key` that is what `needed` made of the
-    user's: `measured`, `drawn` and `energies` are what the two halves of the contract differ in.
+    `measured`, `drawn` and `energies` take whole batches instead, arrays ``(..., 3)``, with a `key` that `needed` made
+    of the user's. They are defined by the two subclasses for deterministic and random transports.
     """
 
     random: ClassVar[bool]
@@ -51,43 +51,43 @@ class Transport(eqx.Module):
     """Whether `prepare_for` makes use of known directions."""
 
     side_by_side: ClassVar[int] = 1
-    """Texels of a map of stacks that are worked on together: `TEXELS` where a stack costs a few numbers."""
+    """How many texels of a map of stacks are computed together; `TEXELS` for stacks of a few numbers."""
 
     def together(self, stack: Stack) -> int:
-        """Texels of a map of simplified stacks that are worked on together."""
+        """How many texels of a map of this (simplified) stack are computed together."""
         return self.side_by_side
 
     @abc.abstractmethod
     def check(self, stack: Stack, names: Sequence[str]) -> None:
-        """Raise a ValueError that names the first layer or base of a simplified stack which it cannot carry.
+        """Raise a ValueError that names the first layer or base of a simplified stack that is not supported.
 
         names: what the user calls the layers, such as ``layers[2]`` (see `layerjax.stack.simplify_and_name`).
         """
 
     @abc.abstractmethod
     def prepare(self, stack: Stack) -> Any:
-        """All the work that no direction is needed for, of a simplified stack."""
+        """Precompute everything that does not depend on direction, for a simplified stack."""
 
     def chosen_for(self, stack: Stack, known: Known) -> "Transport":
-        """The same transport with all that it does not state chosen for the (simplified) stack and known directions."""
+        """The same transport, with open options chosen for a simplified stack and known directions."""
         return self
 
     def chosen_for_energies(self, stack: Stack) -> "Transport":
-        """`chosen_for` energies alone, which no narrow lobe needs a finer resolution for."""
+        """Like `chosen_for`, for energies only, for which narrow lobes do not need a finer resolution."""
         return self.chosen_for(stack, lambda: None)
 
     def prepare_for(self, stack: Stack, known: Known) -> Any:
-        """`prepare` for values at known directions alone, for transports to which these are of use."""
+        """Like `prepare`, for values at known directions only."""
         return self.prepare(stack)
 
     def for_tracing(self, stack: Stack, known: Known) -> "Transport | None":
-        """What gives, within a program where all numbers of the simplified stack are traced, just what this one gives
-        outside, and can be differentiated forward; None: nothing does. Directions are known, and the stack is but for
-        what `grad` or its like differentiates by."""
+        """A transport with the same values, and with forward derivatives, inside a program where all parameters of the
+        simplified stack are traced; None if there is none. Directions are known, and so is the stack except for the
+        parameters by which it is differentiated."""
         return None
 
     def prepare_energies(self, stack: Stack) -> Any:
-        """`prepare` for `energies` alone, for transports that need less for these."""
+        """Like `prepare`, for `energies` only."""
         return self.prepare(stack)
 
     @abc.abstractmethod
@@ -100,20 +100,20 @@ class Transport(eqx.Module):
 
     @abc.abstractmethod
     def needed(self, key: Array | None, function: str) -> Array | None:
-        """The key; None, if it draws nothing. If one is missing, a ValueError for the public function of that name."""
+        """The key, or None for a deterministic transport. ValueError for `function` if it is missing."""
 
     @abc.abstractmethod
     def compared(self) -> "Sequence[Transport] | None":
-        """Transports for an error estimate; None, if `measured` knows them. If there is neither, a ValueError."""
+        """Transports for an error estimate; None if `measured` returns errors. ValueError if there is no estimate."""
 
     @abc.abstractmethod
     def measured(
         self, state: Any, wi: Array, wo: Array, side: Side, channels: int, key: Array | None
     ) -> tuple[Array, Array | None]:
-        """Values ``(..., C)`` of the BSDF in 1/sr, without the cosine, and their errors; None: it knows of none."""
+        """Values ``(..., C)`` of the BSDF in 1/sr, without the cosine, and their errors, or None."""
 
     def doubt(self, state: Any, wi: Array, wo: Array, side: Side, channels: int) -> Array | float:
-        """Error of values ``(..., C)`` in which all resolutions may agree, as where they are cut off below 0."""
+        """Further error of values ``(..., C)`` that all resolutions share, for example where they are clamped to 0."""
         return 0.0
 
     @abc.abstractmethod
@@ -144,7 +144,7 @@ class Transport(eqx.Module):
 
 
 class DeterministicTransport(Transport):
-    """A transport whose values are in closed form, or read off what `prepare` has solved."""
+    """A transport whose values are in closed form, or interpolated from what `prepare` has solved."""
 
     random: ClassVar[bool] = False
 
@@ -200,7 +200,7 @@ class DeterministicTransport(Transport):
 
 
 class RandomTransport(Transport):
-    """A transport that follows light at random: it takes a key, and gives standard errors too."""
+    """A transport by Monte Carlo: it takes a key, and also returns standard errors."""
 
     random: ClassVar[bool] = True
 

@@ -42,9 +42,10 @@ class Media(eqx.Module):
 
 
 class SingleScattering(DeterministicTransport):
-    """Every path with one collision: reflection and transmission, light from above and from below, any number of media.
+    """Exact single scattering: reflection and transmission, light from both sides, any number of media.
 
-    Supports `Medium` layers over any surface or none; a base is seen through the media, without inter-reflection.
+    Supports `Medium` layers over any surface or none. Light of the base is attenuated by the media, without
+    inter-reflection.
     """
 
     side_by_side: ClassVar[int] = TEXELS

@@ -46,9 +46,9 @@ LEAST_SHARE = 0.02
 class WeidlichWilkie(DeterministicTransport):
     """One refracted half vector, no inter-reflection (Weidlich & Wilkie 2007).
 
-    Carries any number of `Interface` layers, and `Medium` layers that only absorb, over any surface; there is no
-    transmission. An albedo must be known to be 0: one that is traced is refused, and so is a Medium that is made inside
-    `jit` (make it outside, and put traced numbers in with `equinox.tree_at`). Reciprocal; lit from below it gives 0.
+    Supports any number of `Interface` layers, and `Medium` layers that only absorb, over any surface, in reflection
+    from above. An albedo of 0 must be known while tracing: make the medium outside `jit`, and insert traced numbers
+    with `equinox.tree_at`. The values are reciprocal.
     """
 
     side_by_side: ClassVar[int] = TEXELS

@@ -51,7 +51,7 @@ def picture(models: Sequence[Model], judged: Sequence[Judged], rows: Sequence[Ro
         for index, panel in enumerate(panels[: len(families)]):
             panel.tick_params(labelbottom=index + columns >= len(families), labelleft=index % columns == 0)
         _legend(panels[len(families)], models)
-        spread = f"compiled; what a stack costs once spread over {VALUES:,} values"
+        spread = f"compiled; preparation divided by {VALUES:,} values"
         figure.supxlabel(f"time per value, ns ({spread})", size=9)
         figure.supylabel("relative L2 error of the BSDF", size=9)
     return figure
@@ -91,8 +91,8 @@ def _legend(panel: Axes, models: Sequence[Model]) -> None:
         span = labels[0] if len(labels) == 1 else f"{labels[0]} to {labels[-1]}"
         colour, marker = _style(index)
         handles.append(Line2D([], [], color=colour, marker=marker, label=f"{model.name}\n({span})"))
-    for size, face, label in ((6.0, "white", "the truth is the limit"), (2.0, INK, "one stack")):
+    for size, face, label in ((6.0, "white", "at the limit of the reference"), (2.0, INK, "one stack")):
         handles.append(Line2D([], [], color=INK, marker="o", markerfacecolor=face, markersize=size, label=label))
         handles[-1].set_linestyle("none")
-    handles.append(Line2D([], [], color=GREY, linestyle=":", label="limit of the truth, median"))
+    handles.append(Line2D([], [], color=GREY, linestyle=":", label="uncertainty of the reference, median"))
     panel.legend(handles=handles, loc="center left", fontsize=7, labelspacing=0.35)

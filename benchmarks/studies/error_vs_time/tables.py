@@ -19,30 +19,29 @@ TEXT = """\
 # Error against run time
 
 {environment}
-{stacks} stacks ({files}); what the pairs of directions are: `benchmarks/suite/cases.py`.
+{stacks} stacks ({files}), at the pairs of directions of `benchmarks/suite/cases.py`.
 {omitted}
 ![Error against time per value, a panel a family](error-vs-time.png)
 
 {words}
 
 A value is a pair of directions with all its channels. *ns a value* is the median of up to {rounds} repeats, everything
-compiled and prepared ({batch:,} pairs at a time; walks {opaque} over a base, {transmitting} if light passes);
-*prepare* is what a stack costs once, and *all, ns* is both when {values:,} values of a stack are evaluated. *compile*
-is the first call less a later one, of both, of stacks whose programs no cache on disk held; stacks that differ in
-numbers alone share it. *operations* counts those of
-the lowered program of an evaluation. Steps that would take longer than {longest:g} s on a stack are omitted.
-Models that are given the stack itself ({called}) are
-timed for few values and for {values:,}: *ns a value* is from the difference, and a dash where that is less than
-{least:.0f} % of what few cost at half of the stacks: timings scatter by as much.
+compiled and prepared ({batch:,} pairs at a time; {opaque} for random walks over a base, {transmitting} without one);
+*prepare* is the preparation of a stack, and *all, ns* is both when {values:,} values of a stack are evaluated.
+*compile* is the first call less a later one, without a cache on disk; stacks of the same structure share it.
+*operations* counts those of the lowered program of an evaluation. Steps that would take longer than {longest:g} s on a
+stack are omitted. Models that are given the stack itself ({called}) are
+timed for few values and for {values:,}: *ns a value* is from the difference, with a dash where that is less than
+{least:.0f} % of the time for few at half of the stacks, which is within the scatter of timings.
 
-The truth is {truth}, solved {dates}. Its uncertainty is its distance from its next coarser resolution,
-and {check} must not find it further off than noise explains: the larger of the two is its limit.
-An error below it is printed as `<=` the limit: there the truth, not the model, is measured.
+The reference is {truth}, computed {dates}. Its limit is the larger of the difference to the next coarser
+resolution and of the deviation that {check} finds beyond its noise.
+An error below the limit is printed as `<=` the limit, since the reference is not more accurate.
 
 ## Summary
 
-Medians over the *stacks* of a family that the model carries (of all there are); *worst* and *albedo* are the largest of
-any of them. `<=`: the truth is the limit, for a median at half of the stacks or more.
+Medians over the *stacks* of a family that the model supports (of all there are); *worst* and *albedo* are the largest
+of any of them. `<=`: at the limit of the reference, for a median at half of the stacks or more.
 
 {summary}
 ## Do the references agree?
@@ -172,7 +171,7 @@ def _summary(models: Sequence[Model], judged: Sequence[Judged], rows: Sequence[R
             )
         parts.append(
             f"### {title.capitalize()}\n\n{table(header, lines)}\n"
-            f"Limit of the truth: median {percent(float(np.median(limits)))} %, at most {percent(max(limits))} %.\n"
+            f"Limit of the reference: median {percent(float(np.median(limits)))} %, at most {percent(max(limits))} %.\n"
         )
     return "\n".join(parts)
 

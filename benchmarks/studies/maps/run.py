@@ -15,37 +15,35 @@ TEXT = """\
 # Fits of maps
 
 {environment}
-Painted maps of {side} x {side} texels, 64 measurements each in one channel with noise of 2 %, {free} free numbers a
-texel, fitted by `fits.fit_map` in chunks of {chunk:,} texels. Everything is warm: what compiles comes before, programs
-are kept on disk, and of each worker the first chunk does not count.
+Painted maps of {side} x {side} texels, 64 measurements each in one channel with noise of 2 %, {free} free parameters
+per texel, fitted by `fits.fit_map` in chunks of {chunk:,} texels. Compilation and the first chunk of each worker are
+not included.
 
-## Texels a second
+## Texels per second
 
-Chunks as `fit_map` does them, reading and writing among them, and fits of single texels by scipy's `least_squares`
-(trust region in the unit box, the same compiled residuals and Jacobian, from where `fit_map` begins) by turns in the
-same {processes} processes, a core each. Where there is an emulator scipy has it too. *compared*: texels that scipy
-fitted; of these *above scipy's* is the share whose cost is above its by more than {rounding:g}, *below* that of costs
-lower by more than {other:g} (another minimum). *pulls*: half of what the middle 68 % of (fit - truth) / error span, of
-the parameter furthest from 1, over texels with all parameters identified within bounds. *chi-square*: reduced, mean.
-*error, sd*: of the model at the optimum beside the solver at the next finer resolution, in standard deviations of a
-measurement, the largest of {checked} texels.
+Chunks of `fit_map`, with reading and writing, alternate with fits of single texels by scipy's `least_squares` (trust
+region, the same compiled residuals and Jacobian, the same starts) in {processes} processes with a core each. scipy uses
+the emulator where `fit_map` does. *compared*: number of texels that scipy fitted. *above scipy's*: share of these whose
+cost is higher than scipy's by more than {rounding:g}; *below*: lower by more than {other:g} (another minimum). *pulls*:
+half the width of the central 68 % of (fit - truth) / error, for the parameter furthest from 1, over texels whose
+parameters are all identified and within bounds. *chi-square*: mean reduced chi-square. *error, sd*: largest numerical
+error of the model at the optimum of {checked} texels, from the next finer resolution, in standard deviations of a
+measurement.
 
 {fits}
 ## Workers
 
-Rates while all workers are at work: they wait for each other after the first chunk, and the last chunk of the first to
-be done ends it; medians of {rounds} rounds in turns. One worker is a spawned process with one thread and chunks
-of the same map. Memory is the most that the system has seen of a worker that compiles
-all programs. {missing}
+Rates while all workers are busy: from the end of the first chunk of the last worker to the end of the last chunk of the
+first; medians of {rounds} interleaved rounds. One worker is one process with one thread. Memory is the peak of a worker
+that compiles all programs. {missing}
 
 {workers}
-## Scaling on paper
+## Estimated scaling
 
-Empty tasks through the engines on this machine, where {processes} workers share its cores with the scheduler: a
-scheduler with a machine of its own is no slower. *scheduler full at*: so many cores ask for chunks as fast as it hands
-them out.
-Times of 4 million texels (2048 x 2048, 2.1 GB of values): the pilot, which one machine fits first, and chunks by
-these rates; cores as fast as these, and a disk that keeps up.
+Rates of empty tasks on this machine, where {processes} workers share the cores with the scheduler. *scheduler full at*:
+number of cores that request chunks as fast as the scheduler sends them. The times of 4 million texels (2048 x 2048,
+2.1 GB of values) are estimates from these rates: the pilot on one machine, then the chunks, with cores of this speed
+and a disk that is not the bottleneck.
 
 {paper}"""
 

@@ -62,16 +62,15 @@ TILTED = lj.Stack(
 )
 
 TEXT = """\
-# The references beside their peers
+# References compared with peers
 
 {environment}
-Wall times, medians of {rounds} interleaved rounds, everything warm; *ratio* is layerjax over the other, the median of
-the ratios within a round. Errors are the largest relative ones, values below 1e-3 of the largest measured against that.
-Of a fixed series of resolutions (nodes x modes of `AddingDoubling`, streams x modes of DISORT) each solver of the full
-BRDF runs at the one that reaches the error in the least time, from the parameters to the values, `AddingDoubling` as
-one compiled function of them; it has 16 x 16 cosines and 33 azimuths. Otherwise `AddingDoubling` runs at the first that
-reaches the error. The layers with axes are measured by their rms error from the walk. Bars: at least, and in
-brackets the aim. {peers}
+Wall times, medians of {rounds} interleaved rounds, without compilation; *ratio* is layerjax over the other, the median
+of the ratios within a round. Errors are the largest relative ones; values below 1e-3 of the largest are relative to
+that. For the full BRDF (16 x 16 cosines, 33 azimuths), each solver runs at the resolution of a fixed series (nodes x
+modes of `AddingDoubling`, streams x modes of DISORT) that reaches the error in the least time, from the parameters to
+the values. Otherwise `AddingDoubling` runs at the first resolution that reaches the error. For layers with axes it is
+the root mean square difference to the random walk. Bars: required, and in brackets the aim. {peers}
 
 {rows}
 {speed}"""

@@ -47,8 +47,8 @@ TEXT = """\
 
 Rough interface over haze over a diffuse base, six free parameters, {count} measurements at four incidences, one
 call from the parameters to the values. `AddingDoubling` runs at the first resolution of a series, from coarse to fine,
-whose largest error is below {error:g}. What is cold is measured in a process of its own, which keeps no compiled
-programs; the rest is warm, medians of interleaved rounds.
+whose largest error is below {error:g}. Cold times are those of a new process without a cache of programs, warm times
+medians of interleaved rounds.
 
 {rows}"""
 

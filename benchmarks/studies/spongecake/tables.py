@@ -12,10 +12,10 @@ TEXT = """\
 {environment}
 ## Held-out materials
 
-Relative L2 error of the BSDF over 12 directions of light a side and 24 of view a hemisphere each (weighted with both
-cosines), beside `AddingDoubling` at ordinates (10, 24), for {one} slabs of one medium and {two} of two, drawn as those
-that were learned from but never seen: median and 95th percentile, in percent. *Single* is the error of
-`SingleScattering` alone, *lobes alone* that of `SpongeCake` without the factor that puts energies right.
+Relative L2 error of the BSDF over 12 directions of light per side and 24 viewers per hemisphere (weighted with both
+cosines), compared with `AddingDoubling` at ordinates (10, 24), for {one} slabs of one medium and {two} of two, from the
+distribution of the training data but not part of them: median and 95th percentile, in percent. *Single* is the error of
+`SingleScattering`, *lobes alone* that of `SpongeCake` without the factor that corrects energies.
 
 {errors}
 ## White furnace

@@ -35,19 +35,19 @@ TEXT = """\
 # Maps of stacks
 
 {environment}
-Every texel is a stack of its own, of which each parameter is a map, under a pair of directions of its own. Medians of
-{rounds} rounds, everything compiled; *gradient* is a value with the derivatives of a mean squared difference in all
-parameter maps, in values; *memory* is what the program of a value holds beside inputs and results, and grows by with
-each texel, of {many:,} and more. Where a map would take longer than {longest:g} s, by the time of a few texels, it
-has fewer *texels*. *principled* and *conductor* are times of our value over those of Mitsuba's `principled` and
-`roughconductor` (`llvm_ad_rgb`, float32) with a texture for every parameter, in the same rounds. {peers}
+Every texel has its own stack, with a map for each parameter, and its own pair of directions. Medians of {rounds}
+rounds, without compilation. *gradient*: time of a value with the derivatives of a mean squared difference by all
+parameter maps, relative to that of a value. *memory*: bytes per texel beside inputs and results, from {many:,} texels
+on. A map that would take longer than {longest:g} s has fewer *texels*. *principled* and *conductor*: time of a value
+relative to Mitsuba's `principled` and `roughconductor` (`llvm_ad_rgb`, float32) with a texture for every parameter, in
+the same rounds. {peers}
 
 {rows}
 ## Verdicts
 
-At least, and in brackets the aim: a value as in the first column, a gradient {gradient} values, compiling a value
-{compile} s and a gradient {compile_gradient} s, {principled} times Mitsuba's `principled`. The slowest of all sizes and
-types counts.
+Required, and in brackets the aim: time of a value as in the first column; gradient {gradient} values; compilation of a
+value {compile} s and of a gradient {compile_gradient} s; {principled} times Mitsuba's `principled`. The slowest of all
+sizes and types counts.
 
 {verdicts}"""
 

@@ -12,17 +12,17 @@ TEXT = """\
 # Throughput
 
 {environment}
-Wall times, medians of {rounds} interleaved rounds, everything warm; *ratio* is layerjax over the other, the median of
-the ratios within a round. BLAS has one thread, which suits such small matrices best. Bars:
-at least, and in brackets the aim. {peers}
+Wall times, medians of {rounds} interleaved rounds, without compilation; *ratio* is layerjax over the other, the median
+of the ratios within a round. BLAS has one thread, which is fastest for such small matrices. Bars: required, and in
+brackets the aim. {peers}
 
 ## Forward models
 
 {pairs:,} direction pairs, RGB. The gradient is that of a mean squared difference, in all parameters (conductor 7,
 SpongeCake 20); numpy's is by forward differences, timed once on a part of the pairs. *operations* counts those of the
 lowered program; *difference* is the largest relative one, of values from numpy's in float64, of gradients from the
-peer's in the same type. *tuned* is a gradient in Dr.Jit with every parameter spread over the lanes, which saves it one
-kernel a parameter; the bars refer to the peer's gradient as one writes it down.
+peer's in the same type. *tuned* is a gradient in Dr.Jit with every parameter broadcast to all lanes, which saves one
+kernel per parameter; the bars refer to the gradient without this.
 
 {forward}
 ## Fits and posteriors

@@ -88,14 +88,15 @@ _TWO_BEAMS = re.compile(r"(?i:dual[ -]?beam)|\biad\s(.*\s)?-X\b")
 
 @dataclass(frozen=True, eq=False)
 class Slab:
-    """A slab as iad describes it, and what was read of it.
+    """A slab and its measurements, from a file of iad.
 
     Attributes:
         totals: a channel for each row of the file, or each wavelength where there are several incidences.
         wavelengths: of the channels, in nm; None where the file has none.
-        ior, ior_slides: refractive indices; of the slides 1 where there are none.
-        thickness_mm: of the sample.
-        asymmetry: g of the channels, None where the file has none.
+        ior: refractive index of the sample.
+        ior_slides: that of the slides; 1 without slides.
+        thickness_mm: thickness of the sample.
+        asymmetry: g of the channels; None where the file has none.
     """
 
     totals: Totals

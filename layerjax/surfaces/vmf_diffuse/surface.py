@@ -30,18 +30,22 @@ NODES = 32
 
 
 class VMFDiffuse(Surface):
-    """Rough diffuse surface, from Lambertian to porous.
+    """Rough diffuse surface, from Lambertian to porous (d'Eon & Weidlich 2024).
 
-    ========= ====== ================ ======= ======================================================================
-    parameter symbol range            default meaning
-    ========= ====== ================ ======= ======================================================================
-    albedo    c      [0, 1]                   albedo of a flake, per channel
-    roughness r      [0, 1]                   flakes have the concentration k = 2 / log(1 - sqrt(r))^2
-    form             "paper" or       "paper" the paper's fit; light scattered four and more times by Eq. (9) with
-                     "literal" or             the exponent atan(X erf(C)) ("paper") or atan(X) erf(C) as printed
-                     "all_orders"             ("literal"; 3 % of that part, 0.0017 in value, at most); or a table
-                                              of what such flakes reflect in all orders ("all_orders")
-    ========= ====== ================ ======= ======================================================================
+    Light is scattered by Lambertian flakes whose normals follow a von Mises-Fisher distribution of concentration k =
+    2 / log(1 - sqrt(r))^2. The first three orders of scattering, and the sum of all later ones, are fits of the
+    paper.
+
+    ========= ====== ======== ==== ====== ======== ============== =====================================================
+    parameter symbol shape    unit range  default  differentiable meaning
+    ========= ====== ======== ==== ====== ======== ============== =====================================================
+    albedo    c      (), (C,) 1    [0, 1] required yes            albedo of a flake
+    roughness r      ()       1    [0, 1] required yes            0: Lambertian; 1: a cloud of Lambertian spheres
+    form                                  "paper"  no             "paper": later orders with the exponent atan(X
+                                                                  erf(C)); "literal": with atan(X) erf(C), as printed,
+                                                                  which changes values by at most 0.0017; "all_orders":
+                                                                  a table of all orders, which conserves energy
+    ========= ====== ======== ==== ====== ======== ============== =====================================================
 
     The fits follow the flakes' own reflection to 1 to 4 % (root mean square), and do not conserve energy: at albedo 1
     they reflect 0.90 to 1.14 of the light, up to albedo 0.95 less than 1 everywhere. Under layers that send nearly all

@@ -91,8 +91,8 @@ PROBED = 8
 
 
 class ResolutionWarning(UserWarning):
-    """A stack is solved less finely than an error of 1e-3 needs, as it would not fit into memory; or it may be, as
-    under ``jit`` the widths of its lobes are not known."""
+    """The resolution may be too low for an error of 1e-3: more would not fit into memory, or, under ``jit``, the widths
+    of the lobes are not known."""
 
 
 class Solved(eqx.Module):
@@ -110,49 +110,47 @@ class Solved(eqx.Module):
 
 
 class AddingDoubling(DeterministicTransport):
-    """Deterministic solution of any stack, all orders of scattering, lit from above and from below.
+    """Adding-doubling: a deterministic solution with all orders of scattering, for light from both sides.
 
-    Carries everything that a `Stack` holds; von Mises-Fisher normals with ``facet_multiple_scattering=False`` only. The
-    work per stack is done in `prepare`; a pair then costs about a microsecond, or 20 to 65 through two interfaces and
-    no base, where light that refracts at both and meets nothing else is integrated over their facets. `evaluate` of a
-    stack that begins (and, if light passes it, ends) with an interface, along up to 256 distinct cosines that are known
-    beforehand, reads nothing off tables: light along them is followed exactly, and half the nodes and modes give the
-    same error or less.
+    Supports every layer and base; von Mises-Fisher normals only with ``facet_multiple_scattering=False``. The work per
+    stack is done in `prepare`. A pair of directions then takes about a microsecond, or 20 to 65 through a slab between
+    two interfaces, where light that is refracted at both and meets nothing else is integrated over their facets. Where
+    `evaluate` knows the directions beforehand (up to 256 distinct cosines), a stack that begins with an interface, and
+    ends with one if it transmits, is solved along these directions without interpolation. Half the nodes and modes then
+    give the same error or less.
 
-    Of a forward peak of Henyey-Greenstein the grid carries what it resolves; the rest counts as ballistic (delta-M,
-    Wiscombe 1977), and light scattered once is corrected for that (TMS, Nakajima & Tanaka 1988). Seen through a bare
-    slab of thickness 2 the largest error of all directions, which is along the beam, was 4e-4 at 24 nodes for g 0.8 and
-    8e-4 at 48 for g 0.9; at 17 degrees from the beam 6e-3 at 48 and 3e-4 at 96 for g 0.97, and 2e-2 at 96 for g 0.99.
-    Of g -0.97, reflection was right to 7e-3 at 48 nodes and to 1e-3 at 96.
+    The part of a Henyey-Greenstein forward peak that the grid does not resolve counts as ballistic (delta-M, Wiscombe
+    1977), with a correction for single scattering (TMS, Nakajima & Tanaka 1988). Through a bare slab of thickness 2,
+    the largest error over all directions, which is along the beam, was 4e-4 at 24 nodes for g = 0.8 and 8e-4 at 48
+    nodes for g = 0.9. At 17 degrees from the beam it was 6e-3 at 48 nodes and 3e-4 at 96 for g = 0.97, and 2e-2 at 96
+    for g = 0.99. The reflection for g = -0.97 was accurate to 7e-3 at 48 nodes and to 1e-3 at 96.
 
-    To be differentiated once, forward or backward: second derivatives may be NaN. At the resolution that is chosen,
-    slopes by indices, albedos and g, and those by widths and thicknesses for a change by their share, were within
-    6e-3 of |f| + mean(f) / 10 on 28 random stacks of seven structures. A width of 0.05 itself is 20 times its share:
-    by that of a coat on metal the slope was off by 3e-2 at the 6 nodes chosen, and by 3e-3 at 12.
+    First derivatives are supported, forward and backward; second derivatives may be NaN. At the automatic resolution,
+    derivatives by indices, albedos, g, and by the logarithms of widths and thicknesses were within 6e-3 of |f| +
+    mean(f) / 10 on 28 random stacks of seven structures. The derivative by a width of 0.05 itself has 20 times this
+    scale: for a coat on metal its error was 3e-2 at the 6 nodes chosen, and 3e-3 at 12.
 
     Args:
-        nodes: cosines a hemisphere (and for each range of angles between critical angles), 2 to 1024. None: as many as
-            give errors of about 1e-3, by the structure of the stack and what is known of it (see `resolution.chosen`).
-            Under `jit` no roughness is known, and lobes of 0.05 are expected: `choose_transport` outside of it knows
-            better, and what it returns costs less inside. A `ResolutionWarning` says where that is guessed, and where
-            memory allows fewer.
-        modes: Fourier modes in azimuth, 1 to 1024, where every medium is symmetric about the normal. None: as many as
-            suit the nodes.
-        ordinates: (cosines, azimuths) a hemisphere where some medium is not, up to 1024 each; azimuths even. None:
-            chosen like nodes. Which of the two it is, is decided while tracing: a traced axis counts as tilted.
-        tolerance: relative error to aim at instead of a resolution: this is climbed until two agree to it, which needs
-            concrete parameters. The error of the result is then about a quarter of the tolerance or less.
-        orders: ``"all"``, only paths with one event (``"first"``, nothing is solved), or those with more
-            (``"multiple"``). An event is a collision, a reflection or refraction at an interface, or a reflection at
-            the base.
-        facet_multiple_scattering: whether light that a facet sends into another is returned diffusely, so that
-            interfaces conserve energy (after Kulla & Conty 2017); else it is lost (Walter 2007). Lossless stacks
-            return, with it, what meets them to 1e-9 as a rule, with 6 nodes at an index of 0.25 or 1.05 to 4e-3. Within
-            1 % of an index of 1 slabs do to 4e-4 (to 1e-5 within 1e-5 of it), and light that meets a single interface
-            at grazing, below a cosine of 0.05, may lose or gain a quarter.
+        nodes: cosines per hemisphere (and for each range of angles between critical angles), 2 to 1024. None: chosen
+            from the stack for errors of about 1e-3. Under `jit` the roughness is not known, and lobes of width 0.05 are
+            assumed; `choose_transport`, called outside, selects a cheaper resolution. A `ResolutionWarning` says where
+            the resolution is a guess, and where memory does not allow the one that is needed.
+        modes: Fourier modes in azimuth, 1 to 1024, for media that are symmetric about the normal. None: chosen with the
+            nodes.
+        ordinates: (cosines, azimuths) per hemisphere, for media that are not, up to 1024 each; an even number of
+            azimuths. None: chosen like nodes. A traced axis counts as not symmetric.
+        tolerance: relative error in place of a resolution: the resolution is increased until two agree to it, which
+            requires concrete parameters. The error of the result is then about a quarter of the tolerance or less.
+        orders: ``"all"``; ``"first"``, only paths with one event; ``"multiple"``, only paths with more. An event is a
+            collision, a reflection or refraction at an interface, or a reflection at the base.
+        facet_multiple_scattering: whether light that is blocked by masking is returned diffusely, so that interfaces
+            conserve energy (after Kulla & Conty 2017); otherwise it is lost (Walter 2007). The energy of lossless
+            stacks is then conserved to 1e-9 as a rule, and to 4e-3 with 6 nodes at an index of 0.25 or 1.05. Within 1 %
+            of an index of 1 it is 4e-4 for slabs (1e-5 within 1e-5 of it), and light that meets a single interface at a
+            cosine below 0.05 may lose or gain a quarter.
 
     Raises:
-        ValueError: an option is out of its range; or `tolerance` cannot be reached, or the stack is traced.
+        ValueError: an option is out of its range, or `tolerance` cannot be reached, or is given for a traced stack.
     """
 
     uses_known: ClassVar[bool] = True

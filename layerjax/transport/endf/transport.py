@@ -37,36 +37,37 @@ class Sides(eqx.Module):
 
 
 class ENDF(DeterministicTransport):
-    """Extended normal distributions: one microfacet lobe a bounce, for a coat on metal or a slab (Guo et al. 2015).
+    """Extended normal distribution functions: one microfacet lobe per bounce, for a coat on metal or a slab (Guo et al.
+    2015).
 
-    Carries one `Interface` over a `Conductor`; a slab, two `Interface` layers of which the second leads back into what
-    surrounds the stack; one `Interface` alone; a bare `Conductor`; with `Medium` layers that only absorb between the
-    two sides. All normals are von Mises-Fisher, with kappa = 2 / alpha^2 for those that are stated as GGX too. An
-    albedo of 0 and an index of 1 must be known while tracing: make them outside `jit`, and put traced numbers in with
+    Supports one `Interface` over a `Conductor`; a slab, that is two `Interface` layers of which the second leads back
+    into the surroundings of the stack; one `Interface` alone; a bare `Conductor`; and `Medium` layers that only absorb
+    between the two sides. All normals are von Mises-Fisher; a GGX width counts as kappa = 2 / alpha^2. An albedo of 0
+    and an index of 1 must be known while tracing: make the stack outside `jit`, and insert traced numbers with
     `equinox.tree_at`.
 
-    Against a Monte Carlo of the same facets, one bounce under a coat of index 1.5 or 2 on a mirror has energy within
-    0.002 by form "reciprocal" where the coat has kappa = 1e4, within 0.023 from kappa = 100 on (all up to 85 degrees),
-    and 0.11 too much at kappa = 10; its shape is within the noise of that Monte Carlo at 1e4 (0.04, sum of differences
-    over sum), within 0.15 from 100 on, and 0.44 off at worst at 10. Form "paper" sees no total reflection: up to 3.5
-    times the energy, and at home only where light inside stays well off the critical angle (up to 30 degrees and kappa
-    >= 100 below). Through a slab the reciprocal form is within 0.06 in energy. See ``python -m benchmarks endf``.
+    Compared with a Monte Carlo of the same facets, one bounce under a coat of index 1.5 or 2 on a mirror (light up to
+    85 degrees) has these errors in form "reciprocal": energy 0.002 at kappa = 1e4, 0.023 from kappa = 100 on, and 0.11
+    too much at kappa = 10; shape (sum of differences over sum) within the noise of 0.04 at 1e4, 0.15 from 100 on, and
+    0.44 at worst at 10. Form "paper" omits total internal reflection: its energy is up to 3.5 times too large, and
+    accurate only where light inside stays far from the critical angle (up to 30 degrees and kappa >= 100 below).
+    Through a slab the energy of the reciprocal form is within 0.06. See ``python -m benchmarks endf``.
 
-    From the second bounce on both forms give too little where a surface is rough: total reflection traps light, which
-    leaves later than they say (kappa 1e3 over 10 along the normal: 0.016 and 0.023, not 0.148). On a mirror the albedo
-    of the reciprocal form with four bounces exceeds 1 by at most 0.04 for indices above 1 (300 stacks, kappa 0.01 to
-    2e6), and by 0.21 for indices down to 0.5; that of the paper's form reaches 2.2 at grazing light.
+    From the second bounce on, both forms underestimate rough surfaces, where total internal reflection traps light
+    (kappa 1e3 over 10 along the normal: 0.016 and 0.023 instead of 0.148). On a mirror, the albedo of the reciprocal
+    form with four bounces exceeds 1 by at most 0.04 for indices above 1 (300 stacks, kappa 0.01 to 2e6), and by 0.21
+    for indices down to 0.5; that of the paper's form reaches 2.2 at grazing light.
 
     Args:
-        bounces: how often light may meet the lower side, 0 to 16; 0: the surface alone (and, through a slab, what is
-            not reflected). The second and later ones are not in the paper.
+        bounces: number of reflections at the lower side, 0 to 16. 0: the surface only (and, through a slab, direct
+            transmission). The second and later ones are not in the paper.
         form: ``"reciprocal"``, lobes about the half vector below the surface: reciprocal, exact for a smooth coat, and
-            not in the paper; ``"paper"``, the paper's lobes with its slips corrected, which follow wi (the paper traces
-            from the viewer: swap wi and wo for that) and are not reciprocal.
-        masking: fit of the masking; ``"normal"`` is exact within 0.03 from kappa = 2 on, ``"paper"`` is Eq. (8).
+            not in the paper; or ``"paper"``, the paper's lobes with its misprints corrected, which follow wi and are
+            not reciprocal (the paper traces from the viewer: exchange wi and wo for that).
+        masking: fit of the masking: ``"normal"``, accurate to 0.03 from kappa = 2 on, or ``"paper"``, Eq. (8).
 
     Raises:
-        ValueError: an option that is none.
+        ValueError: an option has an unknown value.
     """
 
     side_by_side: ClassVar[int] = TEXELS

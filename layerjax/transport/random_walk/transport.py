@@ -26,20 +26,19 @@ from layerjax.transport.random_walk.walk import Orders, Walk
 
 
 class RandomWalk(RandomTransport):
-    """All orders of scattering, unbiased, with a standard error; `evaluate` and `albedo` take a key.
+    """Monte Carlo random walk: all orders of scattering, unbiased, with a standard error; needs a key.
 
-    Carries everything that a stack can hold; von Mises-Fisher normals with ``facet_multiple_scattering=False`` only.
-    Narrow lobes are aimed at, not found by chance: of the interface that wo sees and, without multiple scattering
-    between facets, of the metal or interface opposite. The same key and the same shapes give the same numbers, bit for
-    bit.
+    Supports every layer and base; von Mises-Fisher normals only with ``facet_multiple_scattering=False``. Narrow lobes
+    are importance-sampled: that of the interface on the side of wo and, without multiple scattering between facets,
+    that of the metal or interface opposite. The same key and the same shapes give the same numbers, bit for bit.
 
     Args:
         paths: number of paths for each pair of directions (for each direction of an albedo), >= 2.
         facet_multiple_scattering: whether light is followed on a rough surface until it leaves (Heitz et al. 2016);
-            else it is reflected or refracted once (Walter et al. 2007), and what is masked is lost.
-        orders: ``"all"``; ``"first"``, paths of one event; ``"multiple"``, of two and more. An event is a collision, a
-            reflection or refraction at an interface, or a reflection at the base.
-        batch_size: number of paths that are under way at a time.
+            otherwise it is reflected or refracted once (Walter et al. 2007), and what is masked is lost.
+        orders: ``"all"``; ``"first"``, only paths with one event; ``"multiple"``, only paths with more. An event is a
+            collision, a reflection or refraction at an interface, or a reflection at the base.
+        batch_size: number of paths that are computed at a time.
     """
 
     paths: int = eqx.field(static=True, default=16384)

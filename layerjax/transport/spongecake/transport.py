@@ -45,25 +45,27 @@ class Mapped(eqx.Module):
 
 
 class SpongeCake(DeterministicTransport):
-    """Single scattering exactly, and multiple scattering as a second lobe and a constant (Wang et al. 2022).
+    """Exact single scattering, with multiple scattering as a second lobe and a constant (Wang et al. 2022).
 
-    Carries `Medium` layers over any surface or none. The second lobe's parameters come from a network that has learned
-    from `AddingDoubling`, one medium and two (``python -m layerjax.precompute spongecake``). Of more than two, for
-    the multiple scattering alone, neighbours are put together to a pair first; which ones depends on their numbers, so
-    that these must be known: under ``jit`` or ``grad`` with traced parameters more than two are refused. A base is seen
-    through the media, without inter-reflection. Beyond the paper, the second lobe is multiplied by a factor of either
-    direction that puts its energy right; a second network has learned it of media that absorb nothing.
+    Supports `Medium` layers over any surface or none. A network that was trained on `AddingDoubling` for one and two
+    media gives the parameters of the second lobe (``python -m layerjax.precompute spongecake``). For the multiple
+    scattering of more than two media, neighbours are merged into a pair first. Which are merged depends on their
+    values, so more than two media with traced parameters (under ``jit`` or ``grad``) are refused. Light of the base is
+    attenuated by the media, without inter-reflection. In addition to the paper, a factor of both directions corrects
+    the energy of the second lobe; for media that do not absorb it has a network of its own.
 
-    Relative L2 error of the BSDF over random materials: 2 % for one medium and 4 % for two (median), 9 % and 22 %
-    (95th percentile); most where fibers are narrow (`benchmarks/results/spongecake.md`). Reciprocal, and finite over
-    the box. Albedos of lossless slabs are off by 0.1 % and 0.7 % (median), 2 % and 6 % (95th percentile). At the ends
-    of the box it does not hold: of lossless stacks with half their numbers at an end (abs(g) 0.999, alpha 1e-4,
-    thickness 1e-6 or 1e4) lit at up to 80 degrees, the 95th percentile is 10 % for one haze, 20 % for flakes and 50 %
-    for two hazes, some return 1.6 times what meets them, and sharp flakes at grazing incidence many times that. Within
-    abs(g) < 0.9, alpha > 0.1 and thickness 0.01 to 10 it is 1 %, 5 % and 16 %. `AddingDoubling` holds everywhere.
+    Relative L2 error of the BSDF over random materials: 2 % for one medium and 4 % for two (median), 9 % and 22 % (95th
+    percentile), largest for narrow fibers (`benchmarks/results/spongecake.md`). Albedos of lossless slabs have errors
+    of 0.1 % and 0.7 % (median), 2 % and 6 % (95th percentile). Values are reciprocal and finite for all parameters, but
+    inaccurate at the ends of the ranges: for lossless stacks with half of their parameters at an end (abs(g) 0.999,
+    alpha 1e-4, thickness 1e-6 or 1e4) and light at up to 80 degrees, the 95th percentile is 10 % for one haze, 20 % for
+    flakes and 50 % for two hazes; some reflect 1.6 times the incident light, and sharp flakes at grazing incidence many
+    times as much. Within abs(g) < 0.9, alpha > 0.1 and thickness 0.01 to 10 it is 1 %, 5 % and 16 %. `AddingDoubling`
+    has no such limits.
 
     Args:
-        proposal: what `lj.sample` draws from: the first order alone, as in the paper, or both lobes and the constant.
+        proposal: density that `lj.sample` draws from: ``"first"``, the first order only, as in the paper, or both lobes
+            and the constant.
     """
 
     side_by_side: ClassVar[int] = TEXELS

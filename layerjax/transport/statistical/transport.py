@@ -80,33 +80,35 @@ class Lit(eqx.Module):
 
 
 class Statistical(DeterministicTransport):
-    """Layered statistics: any number of dielectric interfaces and media over a conductor, a diffuse base, or none.
+    """Layered statistics: energy and width of the lobes of interfaces and media over a conductor, a diffuse base or
+    none.
 
-    Carries `Interface`, `Medium` with a Henyey-Greenstein phase function (its forward lobe; backward scattering is not
-    followed), and every base. One that is diffuse, but not Lambertian, counts under layers as f = A(i) A(o) / (pi rho)
-    with its own directional albedo A, of mean rho: energies by its own, of its shape only what that product has.
+    Belcour 2018, and de Dinechin & Belcour 2022 for diffuse bases. Supports `Interface`, `Medium` with a
+    Henyey-Greenstein phase function (forward scattering only), and every base. Under layers, a diffuse base that is not
+    Lambertian counts as f = A(i) A(o) / (pi rho), with its directional albedo A and the mean rho of A.
 
-    The index of an `Interface` is 1/4 to 4 times that above it; others are refused where they are known, and traced
-    ones count as the nearer end. Within 1e-4 of equal indices derivatives by them are finite, but those of tables whose
-    values jitter there: by 3e-4 and less as a rule, by 3e-3 under dyed coats of a lower index.
+    The index of an `Interface` has to be 1/4 to 4 times that above it; a traced index beyond that counts as the nearer
+    end. Derivatives by indices within 1e-4 of each other are finite but follow the interpolation error of the tables:
+    3e-4 and less as a rule, 3e-3 under dyed coats of a lower index.
 
     Args:
-        symmetric: the Symmetric model (statistics at the angle between light and half vector: reciprocal, energy only
-            near 1) or the Forward model (at the angle of the light: conserves energy, not reciprocal); Sec. 6.
-        facet_multiple_scattering: whether interfaces conserve energy (FGD-infinity of the paper, by the walk of
-            Heitz et al. 2016); else light that a facet sends into another is lost (Walter 2007).
-        scattering: ``"orders"``, lobes for 0, 1 and more collisions, or ``"single"``, one lobe and at most one
-            collision a crossing, as the paper has it (Eqs. 20-24); of media alone, with neither interface nor base,
-            that lobe cannot be distinguished from unscattered light, and both are omitted.
-        diffuse: light that has met a diffuse base: ``"tables"``, a closed form with transmittances from tables and few
-            streams, at every texel (over a `Lambertian`, ``facet_multiple_scattering=True``; what else there is as if
-            ``"exact"``); ``"exact"``, those of an adding-doubling solve for every stack; or ``"lobe"``, one GGX lobe
-            from tables (2022), for interfaces and absorbing media over a `Lambertian`.
-        angles: whether the width of a refracted lobe follows the angle (Eq. 10) or is that at normal incidence.
-        own_side: whether light from inside meets the reflectance of the inside, or by reciprocity that from outside.
+        symmetric: the Symmetric model (statistics at the angle between light and half vector: reciprocal, energy
+            approximately conserved) or the Forward model (at the angle of the light: conserves energy, not reciprocal);
+            Sec. 6.
+        facet_multiple_scattering: whether interfaces conserve energy (FGD-infinity of the paper, by the walk of Heitz
+            et al. 2016); otherwise light that is blocked by masking is lost (Walter 2007).
+        scattering: ``"orders"``, lobes for 0, 1 and more collisions; or ``"single"``, one lobe and at most one
+            collision per crossing, as in the paper (Eqs. 20-24). In media without interface or base that lobe cannot be
+            distinguished from unscattered light, and both are omitted.
+        diffuse: how light from a diffuse base is computed: ``"tables"``, a closed form with tabulated transmittances,
+            for a `Lambertian` with ``facet_multiple_scattering=True`` (other bases as ``"exact"``); ``"exact"``, an
+            adding-doubling solution for every stack; or ``"lobe"``, one GGX lobe from tables (2022), for interfaces and
+            absorbing media over a `Lambertian`.
+        angles: whether the width of a refracted lobe depends on the angle (Eq. 10) or is that at normal incidence.
+        own_side: whether light from inside has the reflectance of the inside, or by reciprocity that from outside.
 
     Raises:
-        ValueError: an option that is none.
+        ValueError: an option has an unknown value.
     """
 
     symmetric: bool = eqx.field(static=True, default=True)
