@@ -21,7 +21,7 @@ P = ParamSpec("P")
 T = TypeVar("T")
 
 
-def broadcasting(function: Callable[P, T]) -> Callable[P, T]:
+def allow_broadcasting(function: Callable[P, T]) -> Callable[P, T]:
     """The function with arrays of different ranks broadcast, as this package writes them.
 
     Where a user forbids that of their own code (``jax_numpy_rank_promotion``), what is traced here is not theirs.
@@ -98,7 +98,7 @@ def horner(coefficients: Array | Sequence[Any], x: Array) -> Array:
     return functools.reduce(lambda total, coefficient: coefficient + x * total, coefficients[::-1])
 
 
-def unstacked(x: Array) -> list[Array]:
+def unstack(x: Array) -> list[Array]:
     """The rows of an array; their derivatives are stacked again, and not a sum of arrays of which most is 0."""
     return [row.squeeze(0) for row in jax.lax.split(x, (1,) * x.shape[0])]
 

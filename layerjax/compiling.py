@@ -46,15 +46,17 @@ def compiler_options() -> dict[str, Any]:
         >>> program(stack).shape
         (1,)
     """
-    return dict(_known())
+    return dict(_supported_options())
 
 
 @cache
-def _known() -> dict[str, Any]:
-    return {name: value for name, value in OPTIONS.items() if jax.default_backend() == "cpu" and _is_known(name, value)}
+def _supported_options() -> dict[str, Any]:
+    return {
+        name: value for name, value in OPTIONS.items() if jax.default_backend() == "cpu" and _is_supported(name, value)
+    }
 
 
-def _is_known(name: str, value: Any) -> bool:
+def _is_supported(name: str, value: Any) -> bool:
     try:
         jax.jit(lambda x: x + 1.0, compiler_options={name: value})(0.0)
     except Exception as error:  # XLA's own kinds differ between versions
@@ -117,8 +119,8 @@ def keep_programs() -> str | None:
 
 
 @contextmanager
-def programs_kept() -> Iterator[None]:
-    """`keep_programs` within the block alone; arrays of different ranks broadcast in it (see `broadcasting`)."""
+def program_cache() -> Iterator[None]:
+    """`keep_programs` within the block alone; arrays of different ranks broadcast in it (see `allow_broadcasting`)."""
     from jax.experimental.compilation_cache.compilation_cache import reset_cache
 
     before = {name: jax.config.values[name] for name in (FOLDER, LEAST)}

@@ -19,7 +19,7 @@ from fits.names import EXPORTS, To
 from fits.optimise.result import Fit
 from fits.progress import Progress, given_progress
 from layerjax._checks import in_short
-from layerjax.compiling import programs_kept
+from layerjax.compiling import program_cache
 
 _WRITERS: dict[str, Callable[[Material, Floats | None], Contents]] = {
     "rgl": rgl.contents,
@@ -50,7 +50,7 @@ class ExportReport:
     notes: tuple[str, ...]
 
 
-@programs_kept()
+@program_cache()
 def export(
     material: "lj.Stack | lj.Mixture | Fit",
     path: str | Path,

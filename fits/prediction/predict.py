@@ -35,7 +35,7 @@ from fits.sampling.mixture import Mixture
 from fits.sampling.options import MAX_PARETO_K
 from fits.sampling.posterior import Posterior
 from layerjax._checks import in_short, require_count, require_kind, require_number, require_seed
-from layerjax.compiling import programs_kept
+from layerjax.compiling import program_cache
 
 # quantiles of a `Summary`: the ends of the central 50 % and 95 % intervals, and the median
 LEVELS = (0.025, 0.25, 0.5, 0.75, 0.975)
@@ -244,7 +244,7 @@ class Predictor(Protocol):
     def predict(self, at: Geometry | Measurements, *, draws: int, seed: int) -> Prediction: ...
 
 
-@programs_kept()
+@program_cache()
 def predict(
     fitted: Fit | Posterior | Predictor, at: Geometry | Measurements, *, draws: int = DRAWS, seed: int = 0
 ) -> Prediction:

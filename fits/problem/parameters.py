@@ -22,7 +22,7 @@ import layerjax as lj
 from fits._files import require_switch
 from fits.data.geometry import Floats
 from layerjax._checks import in_short, require_kind, require_number
-from layerjax._shown import Shown
+from layerjax._repr import ReprModule
 from layerjax.mixture import stacks_by_name
 
 SMALLEST = float(np.finfo(float).tiny)  # what is smaller is 0 in compiled programs
@@ -227,7 +227,7 @@ def require_number_or_free(name: str, value: Any, low: float, high: float) -> No
     require_number(f"{name}.high", value.high, low, high)
 
 
-class PowerLaw(Shown):
+class PowerLaw(ReprModule):
     """A number a channel, ``amplitude (wavelength / reference)^-exponent``: in the place of one in a stack.
 
     amplitude: the number at the reference, in its unit, or `Free` with low >= 0. exponent: unitless, or `Free`; of

@@ -23,10 +23,10 @@ from layerjax.normals.facets import Distribution
 from layerjax.normals.ggx import ggx_masking
 from layerjax.quadrature import gauss_legendre
 
-REACH = 3.0
+STRETCH_LIMIT = 3.0
 """Where the sinh of the stretch is bent to end: the narrowest lobe keeps points in its middle."""
 
-VMF_REACH = 3.4
+VMF_EXTENT = 3.4
 """Widths alpha from their peak to where vMF normals end: 1e-5 of them lie beyond."""
 
 SOFT = 0.6
@@ -96,7 +96,7 @@ def parallels(
     end = _azimuth_of(swing, level, squeeze)
     if distribution == "vmf":
         # the density goes like exp(-2 kappa sin_w s sin(psi/2)^2): by this sine, and up to a tangent of psi/4 beyond it
-        last = VMF_REACH / jnp.sqrt(1.0 + 2.0 * vmf.concentration(alpha) * swing)
+        last = VMF_EXTENT / jnp.sqrt(1.0 + 2.0 * vmf.concentration(alpha) * swing)
         end = at_most(end, 0.5 * last * (1.0 + last * last))
     start = None
     if way == "refracted":
@@ -114,7 +114,7 @@ def _azimuth_of(swing: Array, level: Array, squeeze: Array) -> Array:
     return safe_div(up, down + safe_sqrt(up * up + down * down))
 
 
-def seen_facets(
+def visible_normals(
     cosine: Array, sine: Array, at: Parallels, alpha: Array, distribution: Distribution, azimuths: int
 ) -> tuple[Vector, Array, Array]:
     """Normals m seen along w = (-sine, 0, cosine), m . w, and their shares of the visible area: (nodes, points) each.
@@ -182,9 +182,9 @@ def polar_angles(
         share = jnp.where(root[..., None], 1.0 - (1.0 - x) ** 2, x)
         measure = jnp.where(root[..., None], 2.0 * (1.0 - x) * w, w)
     else:
-        share, rise = _rounded(places, x)
+        share, rise = _smooth_edges(places, x)
         measure = rise * w
-    stretched, slope = _stretched(first + width * share, distribution)
+    stretched, slope = _inverse_place(first + width * share, distribution)
     flat = (theta.shape[0], -1)
     return (alpha * stretched).reshape(flat), (alpha * width * measure * slope).reshape(flat)
 
@@ -197,13 +197,13 @@ def _grazing(cosine: Array, sine: Array, ratio: Array, end: Array) -> Array:
     return jnp.where(beyond[:, None], at_most(jnp.arctan2(cosine, within)[:, None], end), end)
 
 
-def _rounded(places: Array, x: Array) -> tuple[Array, Array]:
+def _smooth_edges(places: Array, x: Array) -> tuple[Array, Array]:
     """Shares of panels at x in (0, 1), and their slopes: with the roots at the edges taken out.
 
     Sums over parallels that begin to be cut, or end, have a root there, and so has refraction at the critical angle.
     Where normals end before the edge there is none, and points are not crowded to it.
     """
-    depth = jnp.clip((VMF_REACH - jnp.abs(places)) / (SOFT * VMF_REACH), 0.0, 1.0)
+    depth = jnp.clip((VMF_EXTENT - jnp.abs(places)) / (SOFT * VMF_EXTENT), 0.0, 1.0)
     level = depth * depth * (3.0 - 2.0 * depth)
     after, before = level[:, 1:, None], level.at[:, 0].set(0.0)[:, :-1, None]
     rest = 1.0 - x
@@ -213,16 +213,16 @@ def _rounded(places: Array, x: Array) -> tuple[Array, Array]:
 
 def _place(t: Array, distribution: Distribution) -> Array:
     if distribution == "vmf":
-        return jnp.clip(t, -VMF_REACH, VMF_REACH)
+        return jnp.clip(t, -VMF_EXTENT, VMF_EXTENT)
     y = jnp.arcsinh(t)
-    return y / jnp.sqrt(1.0 + (y / REACH) ** 2)
+    return y / jnp.sqrt(1.0 + (y / STRETCH_LIMIT) ** 2)
 
 
-def _stretched(place: Array, distribution: Distribution) -> tuple[Array, Array]:
+def _inverse_place(place: Array, distribution: Distribution) -> tuple[Array, Array]:
     """t of a place, and its slope: the inverse of `_place`."""
     if distribution == "vmf":
         return place, jnp.ones_like(place)
-    inverse = 1.0 / jnp.sqrt(1.0 - (place / REACH) ** 2)
+    inverse = 1.0 / jnp.sqrt(1.0 - (place / STRETCH_LIMIT) ** 2)
     y = place * inverse
     rise = jnp.expm1(y)
     fall = rise / (1.0 + rise)

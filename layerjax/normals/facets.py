@@ -48,7 +48,7 @@ def density(m: Vector, alpha: Array, distribution: Distribution) -> Array:
     return vmf.hemisphere_density(m, vmf.concentration(alpha))
 
 
-def twice_seen(cosine: Array, w: Vector, alpha: Array, distribution: Distribution) -> Array:
+def twice_projected_area(cosine: Array, w: Vector, alpha: Array, distribution: Distribution) -> Array:
     """2 cos / G1(w): twice the projected area of the facets seen along w, which has this cosine >= 0 with the normal.
 
     Densities of light that a facet scatters are quotients by it, so that no cosine is left to divide by.
@@ -60,7 +60,7 @@ def twice_seen(cosine: Array, w: Vector, alpha: Array, distribution: Distributio
 
 def masking(w: Vector, alpha: Array, distribution: Distribution) -> Array:
     """Smith masking G1(w) for w above the horizon."""
-    return 2.0 * w[2] / twice_seen(w[2], w, alpha, distribution)
+    return 2.0 * w[2] / twice_projected_area(w[2], w, alpha, distribution)
 
 
 def sample(wi: Vector, alpha: Array, u1: Array, u2: Array, distribution: Distribution) -> Vector:

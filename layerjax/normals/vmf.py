@@ -90,7 +90,7 @@ def resultant_slope(kappa: Array) -> Array:
     return jnp.where(small, series, 1.0 / (outer * outer) - 4.0 * decay / (1.0 - decay) ** 2)
 
 
-def convolved(*pairs: tuple[Array, Array]) -> tuple[Array, Array]:
+def convolve(*pairs: tuple[Array, Array]) -> tuple[Array, Array]:
     """(R, 1 - R) of independent turns that follow each other: R is the product of theirs."""
     length, rest = pairs[0]
     for other, missing in pairs[1:]:

@@ -8,7 +8,7 @@ import numpy as np
 from jax import Array
 
 from layerjax._parameters import Parameter
-from layerjax._shown import Shown
+from layerjax._repr import ReprModule
 from layerjax.directions import Vector, add, combine, frame, scale
 from layerjax.normals.sggx import Kind
 from layerjax.quadrature import Rule, sphere_rule
@@ -22,13 +22,13 @@ class Flakes(NamedTuple):
     axis: Parameter
 
 
-class PhaseFunction(Shown):
+class PhaseFunction(ReprModule):
     """Where a collision sends the light: p(wi, wo), which integrates to 1 over wo, and the extinction sigma(w).
 
     Directions come as components that point away from the collision (see `layerjax.directions`): unscattered
     light has wo = -wi. The kernel sigma(wi) p(wi, wo) must be symmetric in wi and wo, and the same for -wi and
     -wo. `pdf` and `sample` are all that a class must add; where sigma is not 1, `cross_section` too, and where p is not
-    the same for all azimuths, `is_upright` and `mirrored`. All else is for speed, accuracy or further transports.
+    the same for all azimuths, `is_axisymmetric` and `mirror`. All else is for speed, accuracy or further transports.
 
     Parameters are fields made by `layerjax._parameters.parameter`, which takes the range of a new one as `limits`.
     """
@@ -84,7 +84,7 @@ class PhaseFunction(Shown):
         return 1.0
 
     @property
-    def onward_width(self) -> Parameter:
+    def ballistic_width(self) -> Parameter:
         """About the angle, in radians and up to 1, within which the ballistic part of a peak falls off.
 
         It counts where one looks through the medium, beside `width`.
@@ -92,15 +92,15 @@ class PhaseFunction(Shown):
         return 1.0
 
     @property
-    def is_upright(self) -> bool:
+    def is_axisymmetric(self) -> bool:
         """Whether p and sigma are known (while tracing) not to change if all directions turn about the normal."""
         return True
 
-    def simplified(self) -> "PhaseFunction":
+    def simplify(self) -> "PhaseFunction":
         """This phase function without an axis that is known to be the normal, so that it stays known under tracing."""
         return self
 
-    def mirrored(self) -> "PhaseFunction":
+    def mirror(self) -> "PhaseFunction":
         """The phase function upside down: its p(wi, wo) is this one's with the z of both directions turned round."""
         return self
 
@@ -118,7 +118,7 @@ class PhaseFunction(Shown):
         return None
 
 
-def deflected(wi: Vector, cosine: Array, sine: Array, phi: Array) -> Vector:
+def deflect(wi: Vector, cosine: Array, sine: Array, phi: Array) -> Vector:
     """Light along wi, turned by an angle with that cosine and sine at the azimuth phi about where it was going."""
     axis = scale(-1.0, wi)
     tangent, bitangent = frame(axis)

@@ -20,8 +20,8 @@ from jax import Array
 
 from layerjax import channels, fresnel
 from layerjax._numerics import absorb, at_least, decay_between, horizon, one_minus_exp, safe_div
-from layerjax.channels import Channels, count, each, largest, mean, per_channel, pick, times, total
-from layerjax.directions import Vector, half_vector, is_above, sanitised, select
+from layerjax.channels import Channels, count, largest, map_channels, mean, multiply, per_channel, pick, total
+from layerjax.directions import Vector, half_vector, is_above, sanitise, select
 from layerjax.quadrature import Nodes
 from layerjax.stack import Interface, Medium, Stack, is_known, media_of, optical_depths
 from layerjax.surfaces import Surface
@@ -47,7 +47,7 @@ class SingleScattering(DeterministicTransport):
     Supports `Medium` layers over any surface or none; a base is seen through the media, without inter-reflection.
     """
 
-    side_by_side: ClassVar[int] = TEXELS
+    texel_batch: ClassVar[int] = TEXELS
 
     def check(self, stack: Stack, names: Sequence[str]) -> None:
         for name, layer in zip(names, stack.layers, strict=True):
@@ -78,7 +78,7 @@ class SingleScattering(DeterministicTransport):
             if state.base is None:
                 far.append(_integral(layer_lobes(state, spread, other_side[0], "all")[index], other_side))
         if state.base is not None:
-            upper = state.base.rule(sanitised(wi), nodes)
+            upper = state.base.rule(sanitise(wi), nodes)
             near.append(_integral(layer_lobes(state, spread, upper[0], "reflection")[BASE], upper))
         zero = jnp.zeros_like(wi[2])
         return total(near, zero), total(far, zero)
@@ -96,10 +96,10 @@ def layer_lobes(slab: Media, wi: Vector, wo: Vector, side: Side) -> dict[int, Ch
         return {}
     valid = is_valid_pair(wi, wo, side, opaque)
     if opaque or side == "reflection":
-        lobes = _from_above(slab, sanitised(wi), sanitised(wo))
+        lobes = _from_above(slab, sanitise(wi), sanitise(wo))
     else:
         edge = horizon(wi[2].dtype)
-        inside_i, inside_o = (sanitised(w, jnp.abs(w[2]) > edge) for w in (wi, wo))
+        inside_i, inside_o = (sanitise(w, jnp.abs(w[2]) > edge) for w in (wi, wo))
         lobes = _from_any_side(slab, inside_i, inside_o, side)
     return {k: channels.select(valid, lobe) for k, lobe in lobes.items()}
 
@@ -130,12 +130,12 @@ def _from_above(slab: Media, wi: Vector, wo: Vector) -> dict[int, Channels]:
         shares = [absorb(tau * (weight * inverse)) for tau in per_channel(medium.thickness)]
         if k in scattering:
             lost = tuple(share / weight for _, share in shares)  # G / (c_i c_o), Eqs. (11) and (12)
-            lobes[k] = times(_collision(medium, wi, wo, half), lost if through is None else times(through, lost))
+            lobes[k] = multiply(_collision(medium, wi, wo, half), lost if through is None else multiply(through, lost))
         if k < last or slab.base is not None:
             transmitted = tuple(share for share, _ in shares)
-            through = transmitted if through is None else times(through, transmitted)
+            through = transmitted if through is None else multiply(through, transmitted)
     if slab.base is not None and through is not None:
-        lobes[BASE] = times(through, slab.base.evaluate(wi, wo))  # Sec. 4.5
+        lobes[BASE] = multiply(through, slab.base.evaluate(wi, wo))  # Sec. 4.5
     return lobes
 
 
@@ -161,8 +161,8 @@ def _from_any_side(slab: Media, wi: Vector, wo: Vector, side: Side) -> dict[int,
 
     for k in scattering:
         medium = slab.media[k]
-        gains = each(gain, per_channel(medium.thickness), depths_i[k], depths_o[k], paths_i[k], paths_o[k])
-        lobes[k] = times(_collision(medium, wi, wo, half), gains)
+        gains = map_channels(gain, per_channel(medium.thickness), depths_i[k], depths_o[k], paths_i[k], paths_o[k])
+        lobes[k] = multiply(_collision(medium, wi, wo, half), gains)
     return lobes
 
 
@@ -191,7 +191,7 @@ def _collision(medium: Medium, wi: Vector, wo: Vector, half: tuple[Vector, Array
     if half is not None and medium.f0 is not None:
         levels = (0.0,) if is_known(medium.f0, 0.0) else per_channel(medium.f0)
         strength = tuple(strength[0] * fresnel.schlick(half[1], f0) for f0 in levels)
-    return strength if is_known(medium.albedo, 1.0) else times(per_channel(medium.albedo), strength)
+    return strength if is_known(medium.albedo, 1.0) else multiply(per_channel(medium.albedo), strength)
 
 
 def choices(slab: Media, wi: Vector) -> list[tuple[Array, Any]]:
@@ -201,13 +201,13 @@ def choices(slab: Media, wi: Vector) -> list[tuple[Array, Any]]:
     """
     edge = horizon(wi[2].dtype)
     valid = wi[2] > edge if slab.base is not None else jnp.abs(wi[2]) > edge
-    wi = sanitised(wi, valid)
+    wi = sanitise(wi, valid)
     depths = optical_depths(slab.media, wi)
     paths = _paths(depths, wi)
     events: list[tuple[Array, Any]] = []
     for k in _scattering(slab):
         medium = slab.media[k]
-        collides = mean(times(tuple(jnp.exp(-path) for path in paths[k]), tuple(map(one_minus_exp, depths[k]))))
+        collides = mean(multiply(tuple(jnp.exp(-path) for path in paths[k]), tuple(map(one_minus_exp, depths[k]))))
         survives = 1.0 if is_known(medium.albedo, 1.0) else largest(per_channel(medium.albedo))
         events.append((collides * survives, medium.phase))
     if slab.base is not None:
@@ -234,10 +234,10 @@ def draw(choices: list[tuple[Array, Any]], wi: Vector, uniforms: tuple[Array, Ar
 def density(choices: list[tuple[Array, Any]], wi: Vector, wo: Vector) -> Array:
     """The density of `draw`, 1/sr."""
     total = jnp.zeros_like(wi[2] * wo[2])
-    off_plane = sanitised(wi, jnp.abs(wi[2]) > horizon(wi[2].dtype))  # of others, zeros too, all probabilities are 0
+    off_plane = sanitise(wi, jnp.abs(wi[2]) > horizon(wi[2].dtype))  # of others, zeros too, all probabilities are 0
     for probability, lobe in choices:
         if isinstance(lobe, Surface):
-            above = jnp.where(is_above(wo), lobe.pdf(sanitised(wi), sanitised(wo)), 0.0)
+            above = jnp.where(is_above(wo), lobe.pdf(sanitise(wi), sanitise(wo)), 0.0)
             total = total + probability * above
         else:
             total = total + probability * lobe.pdf(off_plane, wo)

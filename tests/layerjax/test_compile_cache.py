@@ -9,7 +9,7 @@ import pytest
 from jax.experimental.compilation_cache.compilation_cache import reset_cache
 
 import layerjax as lj
-from layerjax.compiling import FOLDER, LEAST, LEAST_COMPILE, compile_cache, programs_kept
+from layerjax.compiling import FOLDER, LEAST, LEAST_COMPILE, compile_cache, program_cache
 
 
 @pytest.fixture
@@ -28,7 +28,7 @@ def without(monkeypatch, tmp_path):
 def test_programs_are_kept_within_the_block_alone(without, monkeypatch):
     monkeypatch.setattr("layerjax.compiling.LEAST_COMPILE", 0.0)
     least = jax.config.values[LEAST]
-    with programs_kept():
+    with program_cache():
         folder = Path(jax.config.values[FOLDER])
         assert folder == Path(compile_cache())
         assert without in folder.parents
@@ -43,7 +43,7 @@ def test_programs_are_kept_within_the_block_alone(without, monkeypatch):
 
 def test_a_user_who_keeps_programs_keeps_the_same_place(without, tmp_path):
     jax.config.update(FOLDER, str(tmp_path / "own"))
-    with programs_kept():
+    with program_cache():
         assert jax.config.values[FOLDER] == str(tmp_path / "own")
     assert jax.config.values[FOLDER] == str(tmp_path / "own")
     assert lj.keep_programs() == str(tmp_path / "own")
@@ -64,12 +64,12 @@ def test_a_notebook_keeps_its_programs(without):
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
 def test_a_home_that_may_not_be_written_to_keeps_nothing(without):
     without.chmod(stat.S_IRUSR | stat.S_IXUSR)
-    with programs_kept():
+    with program_cache():
         assert jax.config.values[FOLDER] is None
 
 
 def test_a_home_that_is_a_file_keeps_nothing(without, monkeypatch):
     (without / "file").write_text("")
     monkeypatch.setenv("XDG_CACHE_HOME", str(without / "file"))
-    with programs_kept():
+    with program_cache():
         assert jax.config.values[FOLDER] is None

@@ -2,8 +2,8 @@
 
 How much light several collisions leave is known of media that absorb nothing: 1 less what passes untouched and what one
 collision scatters. The same media without absorption therefore tell by how much the second lobe is off. The factor c of
-`layerjax.transport.spongecake.bending` is found by scaling again and again (Sinkhorn) at a few directions, each against
-all directions of the other end.
+`layerjax.transport.spongecake.energy_correction` is found by scaling again and again (Sinkhorn) at a few
+directions, each against all directions of the other end.
 """
 
 from collections.abc import Mapping
@@ -21,7 +21,7 @@ from layerjax.phase import SGGX
 from layerjax.quadrature import gauss_legendre
 from layerjax.stack import Medium, optical_depths
 from layerjax.transport.single_scattering import Media, SingleScattering
-from layerjax.transport.spongecake.bending import polynomial, terms_of
+from layerjax.transport.spongecake.energy_correction import polynomial, term_count
 from layerjax.transport.spongecake.lobes import flux, has_axes, second_lobe
 from layerjax.transport.spongecake.mapping import LEAST_ALPHA
 
@@ -126,7 +126,7 @@ def _directions(rule: Rule, azimuth: Array | None, opposite: bool, dtype: Any) -
 
 def _terms(w: Vector, turning: bool, opposite: bool) -> Array:
     """What log c is a sum of, (..., terms); where sides differ, for above and below, 0 on the side where w is not."""
-    each = jnp.eye(terms_of(turning), dtype=w[2].dtype)
+    each = jnp.eye(term_count(turning), dtype=w[2].dtype)
     terms = jax.vmap(lambda coefficients: polynomial(coefficients, w, opposite), out_axes=-1)(each)
     if opposite:
         return terms

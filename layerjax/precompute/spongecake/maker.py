@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from layerjax.precompute.learning import Schedule
-from layerjax.precompute.spongecake import bending, data, training
+from layerjax.precompute.spongecake import data, energy_correction, training
 from layerjax.precompute.spongecake.data import Split
 from layerjax.transport.spongecake.mapping import pack
 
@@ -40,7 +40,7 @@ PLANS = {
 }
 """By whether the networks are coarse: of second lobes."""
 
-BENDING = {
+CORRECTION_PLANS = {
     False: Plan((30720, 30720), (2048, 2048), Schedule(epochs=150, batch=128)),
     True: Plan((256, 256), (256, 256), Schedule(epochs=10, batch=32)),
 }
@@ -65,9 +65,9 @@ def make(coarse: bool = False, work: Path = Path("spongecake-data"), report: Rep
     table: dict[str, NDArray] = {"seed": np.asarray(SEED)}
     for media in (1, 2):
         net, numbers = _second_lobe(media, PLANS[coarse], work, report)
-        bent = _bend(media, net, BENDING[coarse], work, report)
+        corrections = _energy_correction(media, net, CORRECTION_PLANS[coarse], work, report)
         table |= {f"{media}-{name}": value for name, value in numbers.items()}
-        table |= {f"{media}-bend-{name}": value for name, value in bent.items()}
+        table |= {f"{media}-bend-{name}": value for name, value in corrections.items()}
     return table
 
 
@@ -93,23 +93,26 @@ def _second_lobe(media: int, plan: Plan, work: Path, report: Report) -> tuple[eq
     return net, pack(net) | _record(media, plan, curve, error)
 
 
-def _bend(media: int, net: eqx.nn.MLP, plan: Plan, work: Path, report: Report) -> dict[str, NDArray]:
+def _energy_correction(media: int, net: eqx.nn.MLP, plan: Plan, work: Path, report: Report) -> dict[str, NDArray]:
     """Numbers and record by name of the network that puts the energy of another right."""
     count, tested = plan.train[media - 1], plan.test[media - 1]
     own = work / f"{hashlib.sha256(b''.join(part.tobytes() for part in pack(net).values())).hexdigest()[:12]}"
-    for there in bending.make(own, count + tested, media, {media: net}, SEED):
+    for there in energy_correction.make(own, count + tested, media, {media: net}, SEED):
         report(f"media {media}: energy: {there}/{count + tested}")
-    bent = bending.load(own, count + tested, media, SEED)
-    learned, held_out = bending.rows_of(bent, slice(count)), bending.rows_of(bent, slice(count, None))
+    corrections = energy_correction.load(own, count + tested, media, SEED)
+    learned, held_out = (
+        energy_correction.select(corrections, slice(count)),
+        energy_correction.select(corrections, slice(count, None)),
+    )
 
     def say(line: str) -> None:
         report(f"media {media}: energy: {line}")
 
     with jax.enable_x64(False):
-        bend, curve = bending.train(media, learned, SEED, plan.schedule, own / _state(media, plan), say)
-        error = np.percentile(np.abs(bending.errors(bend, held_out)), PERCENTILES)
+        network, curve = energy_correction.train(media, learned, SEED, plan.schedule, own / _state(media, plan), say)
+        error = np.percentile(np.abs(energy_correction.errors(network, held_out)), PERCENTILES)
     report(f"media {media}: energy: missing energy, median and 95th percentile: {error.round(4).tolist()}")
-    return pack(bend) | _record(media, plan, curve, error)
+    return pack(network) | _record(media, plan, curve, error)
 
 
 def _record(media: int, plan: Plan, curve: NDArray, error: NDArray) -> dict[str, NDArray]:

@@ -85,7 +85,7 @@ def batch_of(samples: Samples) -> Batch:
     sides = sides_of(samples.layers.kind.shape[1])
     wi = samples.wi[:, [1 if side == 1 else 0 for side in sides]]
     wo, values = samples.wo[:, sides], samples.values[:, sides]
-    first = _in_parts(jax.vmap(_first), (jax.tree.map(jnp.asarray, numbers), wi, wo))
+    first = _map_parts(jax.vmap(_first), (jax.tree.map(jnp.asarray, numbers), wi, wo))
     weight = np.abs(wi[..., 2])[..., None]
     size, multiple = (np.sqrt(np.mean(weight * v * v, (2, 3))) for v in (values + first, values))
     return Batch(numbers, *(cast(Array, array) for array in (wi, wo, values, first, size, multiple)))
@@ -138,7 +138,7 @@ def predict(
 
 def errors(net: eqx.nn.MLP, batch: Batch, parts: Parts = ALL_PARTS) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Norms of the error for each pair of sides, (n, s), and errors of directional albedos, (n, s, i)."""
-    return _in_parts(lambda piece: _errors(net, piece, parts), (batch,))
+    return _map_parts(lambda piece: _errors(net, piece, parts), (batch,))
 
 
 def train(
@@ -214,17 +214,17 @@ class PhaseOfKind(PhaseFunction):
     blur: Array
 
     def cross_section(self, w: Vector) -> Array:
-        return self._chosen([phase.cross_section(w) for phase in self._phases()])
+        return self._choose([phase.cross_section(w) for phase in self._phases()])
 
     def kernel(self, wi: Vector, wo: Vector, h: Vector | None) -> Array:
-        return self._chosen([phase.kernel(wi, wo, h) for phase in self._phases()])
+        return self._choose([phase.kernel(wi, wo, h) for phase in self._phases()])
 
     def pdf(self, wi: Vector, wo: Vector) -> Array:
         return self.kernel(wi, wo, None) / self.cross_section(wi)
 
     def sample(self, wi: Vector, u1: Array, u2: Array) -> Vector:
         drawn = [phase.sample(wi, u1, u2) for phase in self._phases()]
-        x, y, z = (self._chosen(list(part)) for part in zip(*drawn, strict=True))
+        x, y, z = (self._choose(list(part)) for part in zip(*drawn, strict=True))
         return x, y, z
 
     def _phases(self) -> list[PhaseFunction]:
@@ -234,7 +234,7 @@ class PhaseOfKind(PhaseFunction):
         flakes = (BlurredSGGX(kind, width, self.axis, self.blur) for kind in ("surface", "fiber"))
         return [*flakes, HenyeyGreenstein(g)]
 
-    def _chosen(self, values: list[Array]) -> Array:
+    def _choose(self, values: list[Array]) -> Array:
         return functools.reduce(lambda other, k: jnp.where(self.kind[k] > 0, values[k], other), range(HG), values[HG])
 
 
@@ -260,7 +260,7 @@ def _values(values: Callable[[Vector, Vector, Side], Channels], media: int, wi: 
     return jnp.stack([values(*pair)[0] for pair in pairs])
 
 
-def _in_parts(work: Callable[..., Any], arguments: tuple[Any, ...], size: int = 256) -> Any:
+def _map_parts(work: Callable[..., Any], arguments: tuple[Any, ...], size: int = 256) -> Any:
     """work on parts of a batch, put together again."""
     count = len(jax.tree.leaves(arguments)[0])
     run = eqx.filter_jit(work)

@@ -75,17 +75,17 @@ def _facing_away(cosine: Array, sine: Array, k: Array) -> Array:
     t = end * x
     up, across = jnp.sin(t), jnp.cos(t)
     tilt = jnp.arctan2(cosine, sine)[..., None]
-    ring = jnp.exp(-2.0 * k * jnp.sin(0.5 * (tilt + t)) ** 2) * _decayed_i0(k * sine[..., None] * across)
+    ring = jnp.exp(-2.0 * k * jnp.sin(0.5 * (tilt + t)) ** 2) * _scaled_i0(k * sine[..., None] * across)
     return end * jnp.sum(weight * up * across * ring, axis=-1) / (2.0 * exprel(2.0 * k))
 
 
 @jax.custom_jvp
-def _decayed_i0(x: Array) -> Array:
+def _scaled_i0(x: Array) -> Array:
     """exp(-x) I0(x) for x >= 0: its slope at 0 is -1, where that of `i0e`, which is even, is given as 0."""
     return i0e(x)
 
 
-@_decayed_i0.defjvp
-def _decayed_i0_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
+@_scaled_i0.defjvp
+def _scaled_i0_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
     value = i0e(*primals)
     return value, (i1e(*primals) - value) * tangents[0]

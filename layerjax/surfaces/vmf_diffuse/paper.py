@@ -35,11 +35,11 @@ def paper_brdf(wi: Vector, wo: Vector, albedos: Channels, roughness: Array, form
         return at_least(_albedo_factor(c, r, form) * shape, 0.0)
 
     # at roughness 0, where the value leaps to that of a Lambertian, the slope in roughness is still that of the fit
-    (f1, f2, f3), (s1, s2, s3) = orders, map(_slope_alone, orders)
+    (f1, f2, f3), (s1, s2, s3) = orders, map(_zero_with_slope, orders)
     values = []
     for c in albedos:
         fitted = c * (f1 + c * (f2 + c * f3)) + multiple(c)  # Eq. (7)
-        flat = c / jnp.pi + c * (s1 + c * (s2 + c * s3)) + _slope_alone(multiple(jax.lax.stop_gradient(c)))
+        flat = c / jnp.pi + c * (s1 + c * (s2 + c * s3)) + _zero_with_slope(multiple(jax.lax.stop_gradient(c)))
         values.append(jnp.where(rough, fitted, flat))
     return tuple(values)
 
@@ -125,6 +125,6 @@ def flake_albedo(k: Array, r: Array) -> Array:
     return at_most(x * root + (1.0 - root) * k, 1.0)
 
 
-def _slope_alone(x: Array) -> Array:
+def _zero_with_slope(x: Array) -> Array:
     """0, with the derivatives of x."""
     return x - jax.lax.stop_gradient(x)

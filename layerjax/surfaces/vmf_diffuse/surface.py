@@ -111,12 +111,12 @@ class VMFDiffuse(Surface):
         for name, value in (("diffuse_albedo", target.albedo), ("roughness", target.roughness)):
             if is_placeholder(value):
                 raise ValueError(f"VMFDiffuse.from_diffuse_albedo: {name} is not given a value")
-        albedo = _solved(target) if exact else flake_albedo(target.albedo, target.roughness)
+        albedo = _solve_albedo(target) if exact else flake_albedo(target.albedo, target.roughness)
         return cls(albedo, target.roughness, form)
 
 
 @eqx.filter_jit
-def _solved(target: VMFDiffuse) -> Array:
+def _solve_albedo(target: VMFDiffuse) -> Array:
     """Albedo of the flakes with which the surface has the target's albedo at normal incidence, by bisection."""
     wanted, r = jnp.broadcast_arrays(jnp.atleast_1d(target.albedo), target.roughness)[0], target.roughness
     x, w = (jnp.asarray(array, wanted.dtype) for array in gauss_legendre(NODES))

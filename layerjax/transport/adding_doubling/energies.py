@@ -12,12 +12,12 @@ import jax.numpy as jnp
 from jax import Array
 
 from layerjax._numerics import at_least, at_most, horizon, not_negative
-from layerjax.channels import Channels, each, select, times, total
+from layerjax.channels import Channels, map_channels, multiply, select, total
 from layerjax.directions import Vector, flip
 from layerjax.stack import Interface, Stack
-from layerjax.transport.adding_doubling.facet_light import Normals, refracted_rays
+from layerjax.transport.adding_doubling.facet_scattering import Normals, refracted_rays
 from layerjax.transport.adding_doubling.operators import Layer, Operator, Parts
-from layerjax.transport.adding_doubling.requested import requested_region
+from layerjax.transport.adding_doubling.requested_directions import requested_region
 from layerjax.transport.first_order import FirstOrder, ReflectingInterface
 from layerjax.transport.single_scattering import Media, SingleScattering
 
@@ -81,20 +81,20 @@ def directional_albedo(
     single = SingleScattering()
     sides = [(first.upper, wi)] + ([] if first.lower is None else [(first.lower, flip(wi))])
     once = total([single.albedo(media, w, nodes)[0] for media, w in sides])
-    lost = total([(_lost(media, w, once[0], nodes),) for media, w in sides])
-    near, far = none_negative(*shares[1:])
-    stays = each(
+    lost = total([(_masking_loss(media, w, once[0], nodes),) for media, w in sides])
+    near, far = clip_negative(*shares[1:])
+    stays = map_channels(
         lambda once, lost, out: at_most(at_least(lost * out, 0.0), at_least(1.0 - once, 0.0)), once, lost, shares[0]
     )
-    inside = each(lambda once, stays: at_least(1.0 - once - stays, 0.0), once, stays)
-    parts = [once, times(inside, near)] + ([stays] if multiple else [])  # else masking absorbs it
+    inside = map_channels(lambda once, stays: at_least(1.0 - once - stays, 0.0), once, stays)
+    parts = [once, multiply(inside, near)] + ([stays] if multiple else [])  # else masking absorbs it
     visible = jnp.abs(wi[2]) > horizon(wi[2].dtype)
     if first.lower is None:
         visible = visible & (wi[2] > 0)
-    return select(visible, total(parts)), select(visible, times(inside, far))
+    return select(visible, total(parts)), select(visible, multiply(inside, far))
 
 
-def _lost(media: Media, w: Vector, reflected: Array, nodes: int) -> Array:
+def _masking_loss(media: Media, w: Vector, reflected: Array, nodes: int) -> Array:
     """Energy that masking takes at a face which is the first that light along w meets; else 0."""
     face = media.base
     if media.media or not isinstance(face, ReflectingInterface):
@@ -106,10 +106,10 @@ def _lost(media: Media, w: Vector, reflected: Array, nodes: int) -> Array:
     return jnp.where(above, at_least(1.0 - reflected - refracted, 0.0), 0.0)
 
 
-def none_negative(near: Channels, far: Channels) -> tuple[Channels, Channels]:
+def clip_negative(near: Channels, far: Channels) -> tuple[Channels, Channels]:
     """Two energies, none below 0: what interpolation takes one below it is the other's, and their sum is kept."""
 
     def balanced(one: Array, other: Array) -> Array:
         return not_negative(not_negative(one) + (other - not_negative(other)))
 
-    return each(balanced, near, far), each(balanced, far, near)
+    return map_channels(balanced, near, far), map_channels(balanced, far, near)

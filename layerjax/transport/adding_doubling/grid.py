@@ -95,7 +95,7 @@ class Grid(eqx.Module):
         return np.arange(self.edges.shape[0])[:, None]
 
 
-def joined(first: Region, second: Region) -> Region:
+def join_regions(first: Region, second: Region) -> Region:
     """The directions of two regions of one index, one after the other."""
     parts = jax.tree.map(lambda a, b: jnp.concatenate([jnp.atleast_1d(a), jnp.atleast_1d(b)]), first, second)
     return eqx.tree_at(lambda region: region.ior, parts, first.ior)
@@ -116,7 +116,7 @@ def make_grid(indices: Sequence[Any], ranks: tuple[int, ...] | None, nodes: int,
         edges = jnp.stack([squares[ranks.index(rank)] for rank in range(max(ranks) + 1)])
     x, w = (jnp.asarray(array, dtype) for array in gauss_legendre(nodes))
     least_width = (MERGED * x[0]) ** 2
-    grid = Grid(_merged(edges, least_width), least_width, (), nodes)
+    grid = Grid(_merge_edges(edges, least_width), least_width, (), nodes)
     x2 = (x * x)[None]
     regions = []
     for n2 in squares:
@@ -132,7 +132,7 @@ def make_grid(indices: Sequence[Any], ranks: tuple[int, ...] | None, nodes: int,
     return eqx.tree_at(lambda g: g.regions, grid, tuple(regions))
 
 
-def _merged(edges: Array, least_width: Array) -> Array:
+def _merge_edges(edges: Array, least_width: Array) -> Array:
     """The edges, each moved up to the next one if that is nearer than `least_width`.
 
     Between indices that nearly agree a panel of its own would hold no node that counts, and the values would change
@@ -144,7 +144,7 @@ def _merged(edges: Array, least_width: Array) -> Array:
     return jnp.stack(merged)
 
 
-def spread(grid: Grid, ior: Array, cosine: Array, sine2: Array, blur: Array) -> Array:
+def interpolation_weights(grid: Grid, ior: Array, cosine: Array, sine2: Array, blur: Array) -> Array:
     """Interpolation weights of directions on all nodes, shape ``cosine.shape + (grid.size,)``, which sum to 1.
 
     Polynomials of the panel's coordinate. Summed against a distribution of directions they *deposit* it on the nodes,
@@ -165,7 +165,7 @@ def spread(grid: Grid, ior: Array, cosine: Array, sine2: Array, blur: Array) -> 
     for k in range(grid.edges.shape[0]):
         low, high = grid.bounds(np.asarray(k), squared_index)
         width = jnp.where(high > low, high - low, 1.0)
-        above = _around(grid, squared_index, k, blur)
+        above = _edge_width(grid, squared_index, k, blur)
         x2 = ((high - squared_index) + squared_index * cosine * cosine) / width
         x = _coordinate_between(x2, (squared - low) / width, below / width, above / width)
         reached.append(_step(squared - grid.edges[k], above, grid.edges[k] < squared_index - grid.least_width))
@@ -175,7 +175,7 @@ def spread(grid: Grid, ior: Array, cosine: Array, sine2: Array, blur: Array) -> 
     return jnp.concatenate(placed, axis=-1)
 
 
-def _around(grid: Grid, squared_index: Array, k: int, blur: Array) -> Array:
+def _edge_width(grid: Grid, squared_index: Array, k: int, blur: Array) -> Array:
     """Half the width of what is around the upper edge of a panel; 0 where there is none in the region."""
     if k + 1 == grid.edges.shape[0]:
         return jnp.zeros_like(squared_index)
@@ -286,7 +286,7 @@ def stencil(grid: Grid, ior: Array, cosine: Array, sine2: Array) -> tuple[Array,
     return first.astype(jnp.int32) + panel * points, place - first
 
 
-def interpolated(grid: Grid, rows: Array, ior: Array, cosine: Array, sine2: Array) -> Array:
+def interpolate_rows(grid: Grid, rows: Array, ior: Array, cosine: Array, sine2: Array) -> Array:
     """Row of a table (points, columns) at directions, shape ``cosine.shape + (columns,)``; see `stencil`."""
     first, place = stencil(grid, ior, cosine, sine2)
     weights = cubic(place)
@@ -307,7 +307,7 @@ def table_region(grid: Grid, region: Region) -> Region:
     return Region(region.ior, cosine, safe_sqrt((1.0 - cosine) * (1.0 + cosine)), one, one, one > 0)
 
 
-def at_table_points(grid: Grid, values: Array) -> Array:
+def table_values(grid: Grid, values: Array) -> Array:
     """Values (..., nodes) at the points of a table, by polynomials in each panel."""
     _, matrix = table_matrix(grid.nodes)
     split = values.reshape(*values.shape[:-1], -1, grid.nodes) @ jnp.asarray(matrix.T, values.dtype)

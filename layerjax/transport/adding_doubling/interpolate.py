@@ -58,7 +58,7 @@ def look_up(tables: Sequence[Array], start: Array, axes: Sequence[Axis]) -> Chan
             place = place + axis.offset(k)
             *others, last = cubic(axis.place)
             weight = weight * jnp.select([k == each for each in range(3)], others, last)
-        found = (_summed(entries, place, inner) for entries in flat)
+        found = (_sum_taps(entries, place, inner) for entries in flat)
         return tuple(total + weight * more for total, more in zip(sums, found, strict=True)), None
 
     every = np.asarray(list(itertools.product(range(4), repeat=len(outer))), np.int32)
@@ -67,10 +67,10 @@ def look_up(tables: Sequence[Array], start: Array, axes: Sequence[Axis]) -> Chan
     return jax.lax.scan(step, (zero,) * len(flat), jnp.asarray(every))[0]
 
 
-def _summed(entries: Array, place: Array, axes: Sequence[Axis]) -> Array:
+def _sum_taps(entries: Array, place: Array, axes: Sequence[Axis]) -> Array:
     """Sum of the entries at a place and the offsets of all axes, times their weights."""
     if not axes:
         return entries.at[place].get(mode="promise_in_bounds")
     axis, *rest = axes
-    parts = [w * _summed(entries, place + axis.offset(k), rest) for k, w in enumerate(cubic(axis.place))]
+    parts = [w * _sum_taps(entries, place + axis.offset(k), rest) for k, w in enumerate(cubic(axis.place))]
     return (parts[0] + parts[1]) + (parts[2] + parts[3])

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from layerjax._batching import by_rows
+from layerjax._batching import map_row_chunks
 from layerjax._numerics import at_least, safe_div
 from layerjax.directions import Vector
 from layerjax.transport.adding_doubling.grid import Region
@@ -71,7 +71,9 @@ def modes_at_nodes(
 
     chunks = out.cosine.size * into.cosine.size * samples // AT_ONCE
     rows = out.cosine, out.sine
-    return [jnp.moveaxis(found, -1, 0) for found in (by_rows(of_rows, rows, chunks) if chunks > 1 else of_rows(rows))]
+    return [
+        jnp.moveaxis(found, -1, 0) for found in (map_row_chunks(of_rows, rows, chunks) if chunks > 1 else of_rows(rows))
+    ]
 
 
 def cosines(x: Array, count: int) -> Array:
@@ -117,7 +119,7 @@ def ballistic_share(missing: Array, weight: Array) -> Array:
     return jnp.diag(safe_div(missing, weight))
 
 
-def scaled_to_energy(region: Region, kernel: Array, energy: Array) -> Array:
+def scale_to_energy(region: Region, kernel: Array, energy: Array) -> Array:
     """Flux operator of a face from its BRDF at the nodes and its albedo, which decides."""
     weight = projected_weight(region)
     scale, missing = balance([(kernel[0], lambda d: d)], weight, jnp.where(region.weight > 0, energy, 0.0))

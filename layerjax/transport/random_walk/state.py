@@ -44,7 +44,7 @@ class PathState(NamedTuple):
     throughput: Channels
     ratios: Channels
     """Density of the path for each channel over that for the channel that draws."""
-    drawn_for: Array | None
+    sampling_channel: Array | None
     """Channel that draws the distances."""
     order: Array | None
     """Number of events so far."""

@@ -32,7 +32,7 @@ from layerjax.transport.random_walk.next_event import (
     meet_opposite,
     no_aim,
     no_relay,
-    relayed,
+    relay_contribution,
     start_aiming,
 )
 from layerjax.transport.random_walk.scene import Scene
@@ -69,7 +69,7 @@ class Walk:
         self.wi = wi
         self.orders: Orders = orders
         self.counts = count_orders or orders != "all"
-        self.multiple = multiple and microsurface.applies(scene)
+        self.multiple = multiple and microsurface.has_microsurface(scene)
         self.goal = None if wo is None else make_goal(scene, wo)
         self.aims = wo is not None and bool(scene.interfaces) and orders != "first"
         # where two surfaces enclose a region, light from one may be aimed through the other
@@ -95,7 +95,7 @@ class Walk:
         if self.goal is not None and target is not None:
             arrived = contribution(self.scene, self.goal, path, arrival, event, target, self.orders)
             if self.relays:
-                more = relayed(self.scene, self.goal, path, arrival, event)
+                more = relay_contribution(self.scene, self.goal, path, arrival, event)
                 arrived = tuple(a + b for a, b in zip(arrived, more, strict=True))
         path, ends = self._continue(path, arrival, event, u)
         return path, Step(arrived, ends, *outside)
@@ -124,13 +124,13 @@ class Walk:
             region=jnp.where(above, index, scene.regions - 1) if scene.regions > 1 else None,
             throughput=(one,) * scene.channels,
             ratios=(one,) * scene.channels if scene.colored_depths else (),
-            drawn_for=drawn if scene.colored_depths else None,
+            sampling_channel=drawn if scene.colored_depths else None,
             order=index if self.counts else None,
             aiming=above & ~above if self.aims or self.relays else None,
             aim=no_aim(scene, direction) if self.aims else None,
             relay=no_relay(scene, direction) if self.relays else None,
             inverse_density=zero if self.mixes else None,
-            facet=microsurface.away(direction) if self.multiple else None,
+            facet=microsurface.off_surface(direction) if self.multiple else None,
         )
 
     def _free_flight(self, path: PathState, u: list[Array]) -> tuple[PathState, Arrival]:
@@ -252,12 +252,12 @@ class Walk:
         entered_above = jnp.where(begins, from_above, facet.entered_above)
         alpha = microsurface.width(scene, surface)
         first, _ = microsurface.free_flight(
-            surfaces.turned(travel, from_above), jnp.zeros_like(u[0]), alpha, -jnp.log(u[5])
+            surfaces.orient(travel, from_above), jnp.zeros_like(u[0]), alpha, -jnp.log(u[5])
         )
         height = jnp.where(begins, first, facet.height)
         walked, height = microsurface.bounce(scene, surface, from_above, travel, height, towards, (u[1], u[2], u[4]))
         side = from_above ^ walked.crosses
-        height, left = microsurface.free_flight(surfaces.turned(walked.direction, side), height, alpha, -jnp.log(u[6]))
+        height, left = microsurface.free_flight(surfaces.orient(walked.direction, side), height, alpha, -jnp.log(u[6]))
         if scene.interfaces:  # nothing is refracted between equal indices: light passes at the first facet
             left = left | (walked.crosses & (scene.surface_ior(surface, from_above) == 1.0))
         faceted = microsurface.has_facets(scene, surface)

@@ -24,11 +24,11 @@ def pair_of(media: tuple[Medium, ...]) -> tuple[Medium, ...]:
         while len(media) > MOST:
             strengths = [float(np.mean(_scattering(medium))) for medium in media]
             at = min(range(len(media) - 1), key=lambda k: min(strengths[k], strengths[k + 1]))
-            media = (*media[:at], _together(media[at], media[at + 1]), *media[at + 2 :])
+            media = (*media[:at], _merge(media[at], media[at + 1]), *media[at + 2 :])
     return media
 
 
-def _together(one: Medium, other: Medium) -> Medium:
+def _merge(one: Medium, other: Medium) -> Medium:
     keeper, guest = sorted((one, other), key=lambda medium: -float(np.mean(_scattering(medium))))
     depths = [jnp.asarray(medium.thickness) * _area(medium.phase) for medium in (keeper, guest)]
     albedos = [jnp.asarray(medium.albedo) * _scattered_share(medium) for medium in (keeper, guest)]

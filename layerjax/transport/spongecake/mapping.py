@@ -122,7 +122,7 @@ def shape_of(net: eqx.nn.MLP, media: Numbers) -> Shape:
     found = []
     for order in orders(count):
         turned = in_order(media, order)
-        raw = _answer(net, turned, turned.albedo, turned.f0)[: 3 * count].reshape(count, 3)
+        raw = _network_output(net, turned, turned.albedo, turned.f0)[: 3 * count].reshape(count, 3)
         found.append(raw[jnp.asarray(order)])  # an order of two is its own inverse
     raw = sum(found[1:], found[0]) / len(found)
     is_hg = media.kind[:, 2] > 0
@@ -139,7 +139,7 @@ def weights_of(net: eqx.nn.MLP, media: Numbers, mean_albedo: Array, mean_f0: Arr
     lobes, levels, slopes, rims = [], [], [], []
     for order in orders(count):
         index = jnp.asarray(order)
-        raw = _answer(net, in_order(media, order), mean_albedo[index], mean_f0[index])[3 * count :]
+        raw = _network_output(net, in_order(media, order), mean_albedo[index], mean_f0[index])[3 * count :]
         strength = jax.nn.softplus(raw.reshape(2, 2 * count + 3))
         lobes.append(strength[:, : 2 * count].reshape(2, count, 2)[:, index])
         levels.append(strength[:, 2 * count])
@@ -156,7 +156,7 @@ def weights_of(net: eqx.nn.MLP, media: Numbers, mean_albedo: Array, mean_f0: Arr
     )
 
 
-def _answer(net: eqx.nn.MLP, media: Numbers, mean_albedo: Array, mean_f0: Array) -> Array:
+def _network_output(net: eqx.nn.MLP, media: Numbers, mean_albedo: Array, mean_f0: Array) -> Array:
     count = len(media.thickness)
     features = []
     for k in range(count):

@@ -92,7 +92,7 @@ def coat_means(alpha: Array, ior: Array, tau: Array) -> Means:
     parts, side = _transmission_parts(table, cosine, alpha, ior)
     weight = 2.0 * weight * cosine / (ior * ior)  # by reciprocity
     one = jnp.ones_like(tau)
-    clear, entering = (at_least(_absorbed(table, "absorption", parts, side, t), 0.0) for t in (one, tau))
+    clear, entering = (at_least(_sum_absorption(table, "absorption", parts, side, t), 0.0) for t in (one, tau))
     out_clear, out = jnp.sum(weight * clear, axis=0), jnp.sum(weight * entering, axis=0)
     moment = jnp.sum(weight * entering * 0.5 * (1.0 - cosine) * (1.0 + cosine), axis=0)
     narrow = 0.25 * at_most(ior * ior, 1.0)  # even on the part of the disc where light can leave
@@ -160,7 +160,7 @@ def stack_lobe(coats: Sequence[Coat], albedo: Array, cosine: Array) -> tuple[Arr
     indices = [jnp.asarray(1.0), *(coat.ior for coat in coats)]
     relative = [below / above for above, below in pairwise(indices)]
     means = [coat_means(coat.alpha, n, coat.tau) for coat, n in zip(coats, relative, strict=True)]
-    energy, below, sigma = _arriving(coats, relative, cosine), albedo, jnp.asarray(0.0)
+    energy, below, sigma = _arrival_share(coats, relative, cosine), albedo, jnp.asarray(0.0)
     for i in reversed(range(len(coats))):
         alpha, n, mean = coats[i].alpha, relative[i], means[i]
         again = 1.0 / (1.0 - mean.returned * below)
@@ -177,7 +177,7 @@ def stack_lobe(coats: Sequence[Coat], albedo: Array, cosine: Array) -> tuple[Arr
     return energy, roughness(sigma)
 
 
-def _arriving(coats: Sequence[Coat], relative: Sequence[Array], cosine: Array) -> Array:
+def _arrival_share(coats: Sequence[Coat], relative: Sequence[Array], cosine: Array) -> Array:
     """Share of light at this cosine that arrives at the base for the first time."""
     energy, back = jnp.ones_like(cosine), jnp.zeros_like(cosine)
     for coat, n in zip(coats, relative, strict=True):
@@ -218,7 +218,7 @@ def width(moment: Array) -> Array:
 def transmission(table: Table, cosine: Array, alpha: Array, ior: Array, tau: Array) -> Array:
     """T01 from a table (Eq. 8)."""
     parts, side = _transmission_parts(table, cosine, alpha, ior)
-    return at_least(_absorbed(table, "absorption", parts, side, tau), 0.0)
+    return at_least(_sum_absorption(table, "absorption", parts, side, tau), 0.0)
 
 
 def reflection(table: Table, alpha: Array, ior: Array, tau: Array) -> Array:
@@ -230,7 +230,7 @@ def reflection(table: Table, alpha: Array, ior: Array, tau: Array) -> Array:
     j, across = spline(jnp.broadcast_to(index_variable(ior), shape), indices)
     plane = _pick(table["returned"], along.dtype, side[..., None, None], i[..., :, None], j[..., None, :])
     parts = jnp.sum((along[..., :, None] * across[..., None, :])[..., None] * plane, axis=(-3, -2))
-    return _absorbed(table, "returned_absorption", parts, side, tau)
+    return _sum_absorption(table, "returned_absorption", parts, side, tau)
 
 
 def cosine_variable(cosine: Array, ior: Array) -> Array:
@@ -275,7 +275,7 @@ def _pick(values: np.ndarray, dtype: jnp.dtype, *index: Array) -> Array:
     return jnp.asarray(values, dtype)[index]
 
 
-def _absorbed(table: Table, name: str, parts: Array, side: Array, tau: Array) -> Array:
+def _sum_absorption(table: Table, name: str, parts: Array, side: Array, tau: Array) -> Array:
     """Sum over the basis in tau of its functions times their parts (..., functions)."""
     powers = _powers(jnp.asarray(tau)[..., None], 1.0 / jnp.asarray(table["cosines"], parts.dtype))
     basis = jnp.asarray(table[name], parts.dtype)  # (side, function, power)

@@ -45,7 +45,7 @@ NODES, WEIGHTS = gauss_legendre(STREAMS)
 def polynomials(cosine: Array | np.ndarray) -> Array:
     """The polynomials that are orthonormal in 2 u du on [0, 1], (..., STREAMS); the first is 1."""
     powers = jnp.stack([cosine**j for j in range(STREAMS)], axis=-1)
-    return times(jnp.asarray(_coefficients(), powers.dtype), powers)
+    return matvec(jnp.asarray(_coefficients(), powers.dtype), powers)
 
 
 @functools.cache
@@ -104,9 +104,9 @@ def _columns(name: str, start: Array | np.ndarray, counts: Sequence[Any], places
     return found
 
 
-def along(shares: Array, onward: Array) -> Array:
+def arrival_share(shares: Array, arrival: Array) -> Array:
     """Share of such light that arrives, by its polynomials."""
-    return dot(shares, onward)
+    return dot(shares, arrival)
 
 
 def two_cosines(shares: Array) -> tuple[Array, Array, Array]:
@@ -132,7 +132,7 @@ def face(alpha: Array, ior: Array) -> Face:
     dense = jnp.where(inverted, 1.0 / ior, ior)
     places = roughness_variable(alpha), index_variable(dense)
     entries = _columns("interface", int(np.prod(INTERFACES)) * np.arange(ENTRIES), INTERFACES, places)
-    inward, outer, inner = unpacked(entries, dense)
+    inward, outer, inner = unpack(entries, dense)
     outward = jnp.swapaxes(inward, -1, -2) / (dense * dense)[..., None, None]
     turn = jnp.asarray(AT_NODES, entries.dtype)
     inward, outward, outer, inner = (matmul(matmul(turn, part), turn.T) for part in (inward, outward, outer, inner))
@@ -144,14 +144,14 @@ def face(alpha: Array, ior: Array) -> Face:
     return Face(chosen(inward, outward), chosen(outward, inward), chosen(outer, inner), chosen(inner, outer))
 
 
-def packed(inward: np.ndarray, outer: np.ndarray, inner: np.ndarray) -> np.ndarray:
+def pack(inward: np.ndarray, outer: np.ndarray, inner: np.ndarray) -> np.ndarray:
     """The entries of an interface that a table holds, (..., ENTRIES), of matrices (..., STREAMS, STREAMS)."""
     rows, columns = np.triu_indices(STREAMS - 1)
     parts = [part[..., 1 + rows, 1 + columns] for part in (outer, inner)]
     return np.concatenate([inward.reshape(*inward.shape[:-2], -1), *parts], axis=-1)
 
 
-def unpacked(entries: Array, dense: Array) -> tuple[Array, Array, Array]:
+def unpack(entries: Array, dense: Array) -> tuple[Array, Array, Array]:
     """Transmission into the denser side and both reflections; their first rows are what is not transmitted."""
     whole = STREAMS * STREAMS
     inward = entries[..., :whole].reshape(*entries.shape[:-1], STREAMS, STREAMS)
@@ -168,9 +168,9 @@ def unpacked(entries: Array, dense: Array) -> tuple[Array, Array, Array]:
     return inward, outer, inner
 
 
-def by_polynomials(onward: Array) -> Array:
+def polynomial_coefficients(arrival: Array) -> Array:
     """Matrix from streams to polynomials."""
-    return times(jnp.asarray(AT_NODES.T, onward.dtype), onward)
+    return matvec(jnp.asarray(AT_NODES.T, arrival.dtype), arrival)
 
 
 def matmul(a: Array, b: Array) -> Array:
@@ -183,7 +183,7 @@ def matmul(a: Array, b: Array) -> Array:
     return dot(a[..., :, None, :], jnp.swapaxes(b, -1, -2)[..., None, :, :])
 
 
-def times(matrix: Array, vector: Array) -> Array:
+def matvec(matrix: Array, vector: Array) -> Array:
     """Product of a small matrix and a vector."""
     return dot(matrix, vector[..., None, :])
 

@@ -185,8 +185,8 @@ def test_packing_keeps_the_matrices() -> None:
     random = np.random.default_rng(1)
     entries = jnp.asarray(random.normal(size=(3, streams.ENTRIES)))
     dense = jnp.asarray([1.0, 1.5, 4.0])
-    inward, outer, inner = map(np.asarray, streams.unpacked(entries, dense))
-    np.testing.assert_allclose(streams.packed(inward, outer, inner), entries, atol=1e-15)
+    inward, outer, inner = map(np.asarray, streams.unpack(entries, dense))
+    np.testing.assert_allclose(streams.pack(inward, outer, inner), entries, atol=1e-15)
     for reflected in (outer, inner):
         np.testing.assert_allclose(reflected, np.swapaxes(reflected, -1, -2), atol=1e-12)
     first = np.eye(streams.STREAMS)[0]

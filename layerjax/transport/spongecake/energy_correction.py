@@ -8,8 +8,8 @@ direction on either side,
 which is next to exp(16 (r - 1)), never negative, and costs no exponential.
 
 Media without absorption tell what c has to be (`layerjax.precompute.spongecake.energy`); a network has learned it from
-them (`layerjax.precompute.spongecake.bending`). Where light is absorbed less of c counts: what absorbs has errors of
-its own.
+them (`layerjax.precompute.spongecake.energy_correction`). Where light is absorbed less of c counts: what absorbs
+has errors of its own.
 """
 
 from collections.abc import Sequence
@@ -49,7 +49,7 @@ LARGEST = 3.0
 """Bound of what the network answers, `POWER` times coefficients of Legendre's polynomials: no factor overflows."""
 
 
-class Bend(eqx.Module):
+class EnergyCorrection(eqx.Module):
     """c: coefficients of its root, as `polynomial` takes them, for light from above and below, (C or 1, 2 or 1, terms).
 
     One medium looks the same from opposite directions, and has one set. share: what counts of c - 1, (C or 1,).
@@ -59,7 +59,7 @@ class Bend(eqx.Module):
     share: Array
 
 
-def share_of(media: tuple[Medium, ...]) -> Array:
+def correction_share(media: tuple[Medium, ...]) -> Array:
     """Share of c - 1 that counts where light is absorbed, (C or 1,)."""
     share = jnp.ones(1)
     for medium in media:
@@ -83,10 +83,10 @@ def polynomial(coefficients: Array | Sequence[Array], w: Vector, opposite: bool)
     return found
 
 
-def bend_network(media: int, key: Array) -> eqx.nn.MLP:
+def correction_network(media: int, key: Array) -> eqx.nn.MLP:
     """A network for so many media that has learned nothing yet: c is next to 1."""
     inputs = media * GEOMETRY_FEATURES + pair_features(media)
-    return perceptron(inputs, DEGREE + 1 + media * _azimuthal(), key)
+    return perceptron(inputs, DEGREE + 1 + media * _azimuthal_count(), key)
 
 
 def coefficients_of(net: eqx.nn.MLP, media: Numbers, turning: bool) -> Array:
@@ -114,10 +114,12 @@ def coefficients_of(net: eqx.nn.MLP, media: Numbers, turning: bool) -> Array:
     return jnp.stack(sides)
 
 
-def factors(bend: Bend, wi: Vector, wo: Vector, from_above: bool) -> Channels:
+def correction_factors(correction: EnergyCorrection, wi: Vector, wo: Vector, from_above: bool) -> Channels:
     """c of both directions, as far as it counts. from_above: both are above."""
-    gains = tuple((_root(sides, wi, from_above) * _root(sides, wo, from_above)) ** POWER for sides in bend.coefficients)
-    shares = per_channel(bend.share)
+    gains = tuple(
+        (_root(sides, wi, from_above) * _root(sides, wo, from_above)) ** POWER for sides in correction.coefficients
+    )
+    shares = per_channel(correction.share)
     channels = max(len(gains), len(shares))
     return tuple(1.0 - pick(shares, c) + pick(shares, c) * pick(gains, c) for c in range(channels))
 
@@ -130,7 +132,7 @@ def _root(sides: Array, w: Vector, from_above: bool) -> Array:
     return polynomial([jnp.where(above, high, low) for high, low in zip(*sides, strict=True)], w, False)
 
 
-def terms_of(turning: bool) -> int:
+def term_count(turning: bool) -> int:
     """How many coefficients the polynomial has for light from one side; `turning`: any of the media has an axis."""
     return sum(degree + 1 for degree in _degrees(turning))
 
@@ -140,7 +142,7 @@ def _degrees(turning: bool) -> tuple[int, ...]:
     return (DEGREE, DEGREE - 1, DEGREE - 1, DEGREE - 2, DEGREE - 2) if turning else (DEGREE,)
 
 
-def _azimuthal() -> int:
+def _azimuthal_count() -> int:
     """Numbers of one medium that azimuthal terms are made of."""
     return DEGREE + DEGREE - 1
 
