@@ -15,7 +15,7 @@ WIDTH, LEFT, RIGHT = 640, 8, 158
 SKY_HEIGHT, LINE, MARGIN = 40, 17, 7
 """Heights of what lies above the layers and of a line of words, and what is left above and below these."""
 
-LONGEST = 68
+MOST_LETTERS = 68
 """Letters of a line."""
 
 INTERFACE, MEDIUM, BASE = "rgba(31, 119, 180, 0.75)", "rgba(31, 119, 180, 0.18)", "rgba(140, 110, 80, 0.35)"
@@ -24,7 +24,7 @@ INTERFACE, MEDIUM, BASE = "rgba(31, 119, 180, 0.75)", "rgba(31, 119, 180, 0.18)"
 Kind = Literal["interface", "medium", "base", "nothing"]
 
 
-class Row(NamedTuple):
+class DiagramRow(NamedTuple):
     """A layer or a base: what it looks like, its name, and its numbers in words."""
 
     kind: Kind
@@ -32,11 +32,11 @@ class Row(NamedTuple):
     words: str
 
 
-def diagram(rows: Sequence[Row], title: str) -> str:
+def diagram(rows: Sequence[DiagramRow], title: str) -> str:
     """SVG of the rows from top to bottom, not to scale, lit from the left and seen from the right."""
     parts, top = [*_light()], SKY_HEIGHT
     for row in rows:
-        lines = textwrap.wrap(row.words, LONGEST) or [""]
+        lines = textwrap.wrap(row.words, MOST_LETTERS) or [""]
         height = 2 * MARGIN + LINE * (1 + len(lines) * bool(row.words))
         parts += [*_layer(row, top, height), *_words(row, lines, top)]
         top += height
@@ -63,7 +63,7 @@ def _light() -> list[str]:
     ]
 
 
-def _layer(row: Row, top: int, height: int) -> list[str]:
+def _layer(row: DiagramRow, top: int, height: int) -> list[str]:
     wide = RIGHT - LEFT
     if row.kind == "nothing":
         middle = (LEFT + RIGHT) // 2
@@ -87,7 +87,7 @@ def _layer(row: Row, top: int, height: int) -> list[str]:
     return [body, f'<path d="{slants}" fill="none" stroke="currentColor" stroke-width="1" opacity="0.6"/>']
 
 
-def _words(row: Row, lines: Sequence[str], top: int) -> list[str]:
+def _words(row: DiagramRow, lines: Sequence[str], top: int) -> list[str]:
     first = top + MARGIN + 13
     name = f'<text x="{RIGHT + 14}" y="{first}" font-weight="bold">{escape(row.name)}</text>'
     rest = [

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from layerjax._checks import in_short
+from layerjax._checks import abbreviate
 
 RANGES: dict[str, tuple[float, float]] = {
     "Interface.ior": (0.25, 4.0),
@@ -116,7 +116,7 @@ def as_floating(name: str, value: Any) -> jax.Array:
                 array = array.astype(jnp.result_type(float))
             return jax.lax.convert_element_type(array, array.dtype)  # drops the weak type: one program for all numbers
     except (TypeError, ValueError, OverflowError):
-        raise ValueError(f"{name}: {in_short(value)} is not a number or an array of real numbers") from None
+        raise ValueError(f"{name}: {abbreviate(value)} is not a number or an array of real numbers") from None
 
 
 def takes_several(name: str) -> bool:
@@ -129,7 +129,7 @@ def _check_shape(name: str, value: Any) -> jax.Array:
     if array.ndim and 0 in array.shape:
         raise ValueError(f"{name}: shape {array.shape} given, which holds no number")
     if isinstance(value, list | tuple) and not takes_several(name):
-        raise ValueError(f"{name}: {in_short(value)} given, must be one number; of a map of stacks it is an array")
+        raise ValueError(f"{name}: {abbreviate(value)} given, must be one number; of a map of stacks it is an array")
     return array
 
 

@@ -115,7 +115,7 @@ def map_shape(stack: Any) -> Shape:
             raise ValueError(
                 f"Stack.{number.name}: shape {number.shape} given, where "
                 f"{next(other.name for other in mapped if other.map_axes == axes)} makes it a map of {axes} "
-                f"{'axis' if axes == 1 else 'axes'}: {_wanted(number, axes)}"
+                f"{'axis' if axes == 1 else 'axes'}: {_expected_shape(number, axes)}"
             )
     try:
         shape = np.broadcast_shapes(*(number.shape[:axes] for number in mapped))
@@ -133,7 +133,7 @@ def map_shape(stack: Any) -> Shape:
         ):
             raise ValueError(
                 f"Stack.{number.name}: shape {number.shape} given in a map of shape {shape}: texels or channels? "
-                f"{_wanted(number, axes)}, or (1, C) for channels that all texels share"
+                f"{_expected_shape(number, axes)}, or (1, C) for channels that all texels share"
             )
     return shape
 
@@ -152,7 +152,7 @@ def _refuse_square(numbers: list[Number], mapped: list[Number]) -> None:
         )
 
 
-def _wanted(number: Number, axes: int) -> str:
+def _expected_shape(number: Number, axes: int) -> str:
     texels = ", ".join("HW" if axes == 2 else "N" * axes)
     if number.by_channel:
         return f"({texels}, 1) is a number a texel, ({texels}, C) one a channel of each"

@@ -18,7 +18,7 @@ from jax.core import Tracer
 P = ParamSpec("P")
 T = TypeVar("T")
 
-FOLDER, LEAST = "jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs"
+CACHE_DIRECTORY, CACHE_LEAST_TIME = "jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs"
 """JAX's settings of its persistent compilation cache."""
 
 LEAST_COMPILE = 0.1
@@ -111,10 +111,10 @@ def keep_programs() -> str | None:
         >>> import layerjax as lj
         >>> folder = lj.keep_programs()
     """
-    if jax.config.values[FOLDER] or not (folder := compile_cache()):
-        return jax.config.values[FOLDER]
-    jax.config.update(FOLDER, folder)
-    jax.config.update(LEAST, LEAST_COMPILE)
+    if jax.config.values[CACHE_DIRECTORY] or not (folder := compile_cache()):
+        return jax.config.values[CACHE_DIRECTORY]
+    jax.config.update(CACHE_DIRECTORY, folder)
+    jax.config.update(CACHE_LEAST_TIME, LEAST_COMPILE)
     return folder
 
 
@@ -123,8 +123,8 @@ def program_cache() -> Iterator[None]:
     """`keep_programs` within the block alone; arrays of different ranks broadcast in it (see `allow_broadcasting`)."""
     from jax.experimental.compilation_cache.compilation_cache import reset_cache
 
-    before = {name: jax.config.values[name] for name in (FOLDER, LEAST)}
-    if before[FOLDER] or not keep_programs():
+    before = {name: jax.config.values[name] for name in (CACHE_DIRECTORY, CACHE_LEAST_TIME)}
+    if before[CACHE_DIRECTORY] or not keep_programs():
         with jax.numpy_rank_promotion("allow"):
             yield
         return

@@ -39,11 +39,11 @@ from layerjax.stack import Stack, media_of, optical_depths, require_numbers, sim
 from layerjax.transport import Side, Transport
 from layerjax.transport.known_directions import (
     MOST_COSINES,
-    Known,
+    DirectionLookup,
     KnownDirections,
     known_above,
     known_directions,
-    own_cosines,
+    separate_cosines,
 )
 
 
@@ -98,9 +98,9 @@ def evaluate_known(
     """
     require_choice("side", side, get_args(Side))
     wi, wo = read_directions(wi=wi, wo=wo)
-    if known is not None and (known.of_wi.shape, known.of_wo.shape) != (wi.shape[:-1], wo.shape[:-1]):
+    if known is not None and (known.wi_index.shape, known.wo_index.shape) != (wi.shape[:-1], wo.shape[:-1]):
         raise ValueError(
-            f"known: it is of directions of shapes {known.of_wi.shape} and {known.of_wo.shape}, "
+            f"known: it is of directions of shapes {known.wi_index.shape} and {known.wo_index.shape}, "
             f"wi and wo have {wi.shape[:-1]} and {wo.shape[:-1]}"
         )
     if isinstance(stack, Mixture):
@@ -182,8 +182,8 @@ def sample(
         return _sample_mixture(stack, wi, key, transport)
     shape = _shape_of(stack)
     if shape:
-        mapped, chosen, at = _resolve_map(stack, transport, shape, wi)
-        return maps.draws(mapped, chosen, at, at.broadcast(wi), channel_count(stack), key)
+        mapped, chosen, layout = _resolve_map(stack, transport, shape, wi)
+        return maps.draws(mapped, chosen, layout, layout.broadcast(wi), channel_count(stack), key)
     return _sample(ensure_prepared(stack, transport, wi.dtype), wi, key)
 
 
@@ -200,8 +200,8 @@ def pdf(
         return _broadcast_parts(stack).mean(lambda part, _: pdf(part, wi, wo, transport), by_channel=False)
     shape = _shape_of(stack)
     if shape:
-        mapped, chosen, at = _resolve_map(stack, transport, shape, wi, wo)
-        return maps.densities(mapped, chosen, at, (at.broadcast(wi), at.broadcast(wo)))
+        mapped, chosen, layout = _resolve_map(stack, transport, shape, wi, wo)
+        return maps.densities(mapped, chosen, layout, (layout.broadcast(wi), layout.broadcast(wo)))
     return _pdf(ensure_prepared(stack, transport, wi.dtype), wi, wo)
 
 
@@ -230,9 +230,9 @@ def albedo(
         )
     shape = _shape_of(stack)
     if shape:
-        mapped, chosen, at = _resolve_map(stack, transport, shape, wi)
+        mapped, chosen, layout = _resolve_map(stack, transport, shape, wi)
         given = chosen.resolve_key(key, "albedo")
-        return maps.albedos(mapped, chosen, at, at.broadcast(wi), channel_count(stack), nodes, given)
+        return maps.albedos(mapped, chosen, layout, layout.broadcast(wi), channel_count(stack), nodes, given)
     prepared = ensure_prepared_for_albedo(stack, transport, wi.dtype)
     return _albedo(prepared, wi, nodes, prepared.transport.resolve_key(key, "albedo"))
 
@@ -346,34 +346,36 @@ def _shape_of(stack: Stack | Mixture | Prepared) -> Shape:
 
 
 def _resolve_map(
-    stack: Any, transport: Any, shape: Shape, *directions: Array, known: Known = lambda: None
+    stack: Any, transport: Any, shape: Shape, *directions: Array, known: DirectionLookup = lambda: None
 ) -> tuple[Stack, Transport, maps.Layout]:
     """A simplified map of stacks in the precision of the directions, its transport, and how these lie over it."""
-    at = maps.layout(shape, *directions)
+    layout = maps.layout(shape, *directions)
     chosen, simplified = resolve_transport(stack, transport, known)
-    return cast_arrays(simplified, directions[0].dtype), chosen, at
+    return cast_arrays(simplified, directions[0].dtype), chosen, layout
 
 
 def _evaluate_map(
     stack: Any, wi: Array, wo: Array, transport: Any, side: Side, key: Array | None, shape: Shape
 ) -> Array:
-    at = maps.layout(shape, wi, wo)
-    directions = at.broadcast(wi), at.broadcast(wo)
-    pairs = math.prod(at.outer_axes)
-    own_known = not at.shared and 0 < 2 * pairs <= MOST_COSINES
-    first = [w if at.shared else w[0] for w in directions] if pairs and not at.empty else None
+    layout = maps.layout(shape, wi, wo)
+    directions = layout.broadcast(wi), layout.broadcast(wo)
+    pairs = math.prod(layout.outer_axes)
+    own_known = not layout.shared and 0 < 2 * pairs <= MOST_COSINES
+    first = [w if layout.shared else w[0] for w in directions] if pairs and not layout.empty else None
     known, above = None, own_known and known_above(wi, wo)
     if first is not None:
-        known = own_cosines(first[0], first[1], above) if own_known else known_directions(*first)
+        known = separate_cosines(first[0], first[1], above) if own_known else known_directions(*first)
     mapped, chosen, _ = _resolve_map(stack, transport, shape, wi, wo, known=lambda: known)
     given, channels = chosen.resolve_key(key, "evaluate"), channel_count(stack)
     if not chosen.uses_known_directions:
         known, own_known = None, False
     own = maps.TexelDirections(own_known, above)
-    return maps.values(mapped, chosen, at, directions, side, channels, given, None if own_known else known, own)
+    return maps.values(mapped, chosen, layout, directions, side, channels, given, None if own_known else known, own)
 
 
-def _prepare_comparisons(stack: Stack | Prepared, transport: Transport, known: Known) -> list[Prepared] | None:
+def _prepare_comparisons(
+    stack: Stack | Prepared, transport: Transport, known: DirectionLookup
+) -> list[Prepared] | None:
     """The stack prepared for the transports of an error estimate; None, if it knows errors itself."""
     others = transport.comparison_transports()
     if others is None:

@@ -21,7 +21,7 @@ from layerjax._shapes import Shape, axes_of_map
 from layerjax.directions import join, split
 from layerjax.stack import Stack
 from layerjax.transport.contract import TEXELS, Side, Transport
-from layerjax.transport.known_directions import KnownDirections, own_cosines
+from layerjax.transport.known_directions import KnownDirections, separate_cosines
 
 
 class Layout(NamedTuple):
@@ -88,7 +88,9 @@ def layout(shape: Shape, *directions: Array) -> Layout:
     return Layout(shape, result[: len(result) - over], shared)
 
 
-def map_texels(function: Callable[..., Any], stack: Stack, at: Layout, rows: Sequence[Array], batch_size: int) -> Any:
+def map_texels(
+    function: Callable[..., Any], stack: Stack, layout: Layout, rows: Sequence[Array], batch_size: int
+) -> Any:
     """function(stack, *rows) of every texel; what it returns along a new first axis.
 
     Args:
@@ -96,12 +98,12 @@ def map_texels(function: Callable[..., Any], stack: Stack, at: Layout, rows: Seq
         rows: arrays (texels, ...), an entry for each.
         batch_size: texels that are computed together.
     """
-    texels = math.prod(at.shape)
+    texels = math.prod(layout.shape)
     leaves, structure = jax.tree.flatten(stack)
-    mapped = jax.tree.leaves(axes_of_map(stack, at.shape))
-    over = len(at.shape)
+    mapped = jax.tree.leaves(axes_of_map(stack, layout.shape))
+    over = len(layout.shape)
     numbers = [
-        jnp.broadcast_to(leaf, (*at.shape, *leaf.shape[over:])).reshape(texels, *leaf.shape[over:])
+        jnp.broadcast_to(leaf, (*layout.shape, *leaf.shape[over:])).reshape(texels, *leaf.shape[over:])
         for leaf, is_mapped in zip(leaves, mapped, strict=True)
         if is_mapped
     ]
@@ -137,7 +139,7 @@ def _map_batches(one: Callable[..., Any], batch_size: int, rows: Any) -> Any:
 def values(
     stack: Stack,
     transport: Transport,
-    at: Layout,
+    layout: Layout,
     directions: tuple[Array, Array],
     side: Side,
     channels: int,
@@ -145,26 +147,26 @@ def values(
     known: KnownDirections | None,
     texels: TexelDirections,
 ) -> Array:
-    """BSDF of every texel of a simplified map, ``at.result + (channels,)``.
+    """BSDF of every texel of a simplified map, ``layout.result + (channels,)``.
 
     directions: wi and wo as `Layout.broadcast` gives them. known: of directions that are shared.
     """
 
     def one(stack: Stack, wi: Array, wo: Array, key: Array | None) -> tuple[Array, ...]:
         state = transport.prepare_for_directions(
-            stack, lambda: own_cosines(wi, wo, texels.above) if texels.known else known
+            stack, lambda: separate_cosines(wi, wo, texels.above) if texels.known else known
         )
         found, _ = transport.evaluate_batch(state, wi, wo, side, channels, key)
         return tuple(found[..., c] for c in range(channels))
 
     return jnp.stack(
-        [at.gather(value) for value in _map_directions(one, stack, transport, at, directions, key)], axis=-1
+        [layout.gather(value) for value in _map_directions(one, stack, transport, layout, directions, key)], axis=-1
     )
 
 
 @compile_for_devices
 def draws(
-    stack: Stack, transport: Transport, at: Layout, wi: Array, channels: int, key: Array
+    stack: Stack, transport: Transport, layout: Layout, wi: Array, channels: int, key: Array
 ) -> tuple[Array, Array, Array]:
     """Directions drawn, densities and weights for every texel, as `layerjax.sample` gives them."""
 
@@ -172,67 +174,71 @@ def draws(
         wo, density, weight = transport.sample_batch(transport.prepare(stack), wi, channels, key)
         return (*split(wo), density, *(weight[..., c] for c in range(channels)))
 
-    found = [at.gather(value) for value in _map_directions(one, stack, transport, at, (wi,), key)]
+    found = [layout.gather(value) for value in _map_directions(one, stack, transport, layout, (wi,), key)]
     return jnp.stack(found[:3], axis=-1), found[3], jnp.stack(found[4:], axis=-1)
 
 
 @compile_for_devices
-def densities(stack: Stack, transport: Transport, at: Layout, directions: tuple[Array, Array]) -> Array:
-    """Density of draws of every texel, ``at.result``."""
+def densities(stack: Stack, transport: Transport, layout: Layout, directions: tuple[Array, Array]) -> Array:
+    """Density of draws of every texel, ``layout.result``."""
 
     def one(stack: Stack, wi: Array, wo: Array, key: None) -> Array:
         return transport.pdf(transport.prepare(stack), split(wi), split(wo))
 
-    return at.gather(_map_directions(one, stack, transport, at, directions, None))
+    return layout.gather(_map_directions(one, stack, transport, layout, directions, None))
 
 
 @compile_for_devices
 def albedos(
-    stack: Stack, transport: Transport, at: Layout, wi: Array, channels: int, nodes: int, key: Array | None
+    stack: Stack, transport: Transport, layout: Layout, wi: Array, channels: int, nodes: int, key: Array | None
 ) -> tuple[Array, Array]:
-    """Scattered energy of every texel on wi's side and on the other, ``at.result + (channels,)`` each."""
+    """Scattered energy of every texel on wi's side and on the other, ``layout.result + (channels,)`` each."""
 
     def one(stack: Stack, wi: Array, key: Array | None) -> tuple[Array, Array]:
         return transport.albedo_batch(transport.prepare_for_albedo(stack), wi, channels, nodes, key)
 
-    near, far = _map_directions(one, stack, transport, at, (wi,), key, batch_size=1)
-    return at.gather(near), at.gather(far)
+    near, far = _map_directions(one, stack, transport, layout, (wi,), key, batch_size=1)
+    return layout.gather(near), layout.gather(far)
 
 
 def _map_directions(
     function: Callable[..., Any],
     stack: Stack,
     transport: Transport,
-    at: Layout,
+    layout: Layout,
     directions: Sequence[Array],
     key: Array | None,
     batch_size: int | None = None,
 ) -> Any:
     """function(stack, *directions, key) of every texel, each with a key of its own; see `map_texels`."""
-    pairs = max(1, math.prod(at.outer_axes))
+    pairs = max(1, math.prod(layout.outer_axes))
     batch_size = (
         max(1, chunk_factor() * transport.texel_batch_size(stack) // pairs) if batch_size is None else batch_size
     )
-    keys = [] if key is None else [jax.random.split(key, math.prod(at.shape))]
-    if at.shared:
+    keys = [] if key is None else [jax.random.split(key, math.prod(layout.shape))]
+    if layout.shared:
         parts: Sequence[Array] = []
     else:  # as components: to read every third number takes as long as the arithmetic
         parts = [part for w in directions for part in split(w)]
 
     def of_components(stack: Stack, *rest: Array) -> Any:
-        w = directions if at.shared else [join((rest[k], rest[k + 1], rest[k + 2])) for k in range(0, len(parts), 3)]
+        w = (
+            directions
+            if layout.shared
+            else [join((rest[k], rest[k + 1], rest[k + 2])) for k in range(0, len(parts), 3)]
+        )
         return function(stack, *w, rest[-1] if keys else None)
 
-    return map_texels(of_components, stack, at, [*parts, *keys], batch_size)
+    return map_texels(of_components, stack, layout, [*parts, *keys], batch_size)
 
 
 @compile_for_devices
-def evaluate_texels(function: Callable[..., Array], stack: Stack, at: Layout, w: Array, *options: Any) -> Array:
-    """function(stack, w, *options) of every texel, ``at.result + ...``."""
-    rows = [] if at.shared else [at.broadcast(w)]
+def evaluate_texels(function: Callable[..., Array], stack: Stack, layout: Layout, w: Array, *options: Any) -> Array:
+    """function(stack, w, *options) of every texel, ``layout.result + ...``."""
+    rows = [] if layout.shared else [layout.broadcast(w)]
 
     def one(stack: Stack, *row: Array) -> Array:
-        return function(stack, row[0] if row else at.broadcast(w), *options)
+        return function(stack, row[0] if row else layout.broadcast(w), *options)
 
-    batch_size = max(1, chunk_factor() * TEXELS // max(1, math.prod(at.outer_axes)))
-    return at.gather(map_texels(one, stack, at, rows, batch_size))
+    batch_size = max(1, chunk_factor() * TEXELS // max(1, math.prod(layout.outer_axes)))
+    return layout.gather(map_texels(one, stack, layout, rows, batch_size))

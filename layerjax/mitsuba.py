@@ -52,7 +52,7 @@ def bsdf(stack: Stack | Mixture, transport: Any = "auto", id: str = "layerjax") 
     """
     properties = mi.Properties(NAME)
     properties.set_id(id)
-    return _plugin(mi.variant())(properties, Material(stack, transport))
+    return _plugin(mi.variant())(properties, PluginMaterial(stack, transport))
 
 
 def register() -> None:
@@ -69,7 +69,7 @@ def register() -> None:
     mi.register_bsdf(NAME, _plugin(variant))
 
 
-class Material:
+class PluginMaterial:
     """A stack as the plugin holds it. numbers: arrays of Dr.Jit, by the names that `mi.traverse` shows."""
 
     def __init__(self, stack: Stack | Mixture, transport: Any):
@@ -98,11 +98,11 @@ class Material:
         Raises:
             ValueError: one is out of its range.
         """
-        found = self.with_numbers({name: jnp.asarray(np.array(value)) for name, value in self.numbers.items()})
+        found = self.replace_numbers({name: jnp.asarray(np.array(value)) for name, value in self.numbers.items()})
         _check(found)
         self._set_stack(found)
 
-    def with_numbers(self, values: dict[str, Array]) -> Any:
+    def replace_numbers(self, values: dict[str, Array]) -> Any:
         """The stack with these numbers, each in the shape that it has there, and its own where there is none."""
         leaves = [jnp.reshape(values.get(name, leaf), leaf.shape) for name, leaf in leaves_with_names(self.stack)]
         return jax.tree.unflatten(jax.tree.structure(self.stack), leaves)
@@ -113,7 +113,7 @@ class Material:
         def values_of(numbers: Any, light: Any, viewer: Any, *place: Any) -> tuple[Array, ...]:
             key = _key(light, viewer, *place) if self.is_random else None
             if numbers:
-                values = evaluate(self.with_numbers(numbers), _rows(light), _rows(viewer), self.transport, key=key)
+                values = evaluate(self.replace_numbers(numbers), _rows(light), _rows(viewer), self.transport, key=key)
             else:
                 values = evaluate(self.prepared, _rows(light), _rows(viewer), key=key)
             return self._split_colours(values)
@@ -125,7 +125,7 @@ class Material:
         """Share of the light that passes without being scattered, a spectrum."""
 
         def shares_of(numbers: Any, wi: Any) -> tuple[Array, ...]:
-            return self._split_colours(unscattered(self.with_numbers(numbers), _rows(wi)))
+            return self._split_colours(unscattered(self.replace_numbers(numbers), _rows(wi)))
 
         return mi.Spectrum(*_call_in_batches(shares_of, self._differentiable(), wi))
 
@@ -160,7 +160,7 @@ def _plugin(variant: str) -> type:
     """The class for this variant, which is that which is set."""
 
     class Layered(mi.BSDF):
-        def __init__(self, properties: Any, material: Material | None = None):
+        def __init__(self, properties: Any, material: PluginMaterial | None = None):
             mi.BSDF.__init__(self, properties)
             self.material = _scene_material(properties) if material is None else material
             self._name_components()
@@ -202,23 +202,23 @@ def _plugin(variant: str) -> type:
     return Layered
 
 
-def _scene_material(properties: Any) -> Material:
+def _scene_material(properties: Any) -> PluginMaterial:
     """The material that a scene names."""
     name = properties.get("material", "")
     if name not in (*materials, *gallery.names()):
         known = ", ".join((*materials, *gallery.names()))
         raise ValueError(f"material: {name!r} is neither in layerjax.mitsuba.materials nor in the gallery: {known}")
-    return Material(*(materials[name] if name in materials else (gallery.stack(name), "auto")))
+    return PluginMaterial(*(materials[name] if name in materials else (gallery.stack(name), "auto")))
 
 
-def _evaluate(material: Material, ctx: Any, si: Any, wo: Any, active: Any) -> Any:
+def _evaluate(material: PluginMaterial, ctx: Any, si: Any, wo: Any, active: Any) -> Any:
     light, viewer = (wo, si.wi) if ctx.mode == mi.TransportMode.Radiance else (si.wi, wo)
     active = active & _is_enabled(material, ctx, si.wi, wo)
     value = material.value(light, viewer, si.p) * dr.abs(mi.Frame3f.cos_theta(wo))
     return dr.select(active, value, 0.0)
 
 
-def _evaluate_with_pdf(material: Material, ctx: Any, si: Any, wo: Any, active: Any) -> tuple[Any, Any]:
+def _evaluate_with_pdf(material: PluginMaterial, ctx: Any, si: Any, wo: Any, active: Any) -> tuple[Any, Any]:
     """Value and density. Where light cannot go there is none of either: what is drawn there counts as not drawn."""
     value = _evaluate(material, ctx, si, wo, active)
     density = material.density(si.wi, wo) * (1.0 - _null_probability(material, ctx, si))
@@ -226,7 +226,7 @@ def _evaluate_with_pdf(material: Material, ctx: Any, si: Any, wo: Any, active: A
     return value, dr.select(active, density, 0.0)
 
 
-def _sample(material: Material, ctx: Any, si: Any, sample1: Any, sample2: Any, active: Any) -> tuple[Any, Any]:
+def _sample(material: PluginMaterial, ctx: Any, si: Any, sample1: Any, sample2: Any, active: Any) -> tuple[Any, Any]:
     """Directions are drawn without derivatives, and the value over their density has those of the value."""
     null = _null_probability(material, ctx, si)
     wo, density = material.draw(si.wi, mi.Vector3f(sample1, *sample2))
@@ -251,14 +251,14 @@ def _sample(material: Material, ctx: Any, si: Any, sample1: Any, sample2: Any, a
     return drawn, dr.select(active & (drawn.pdf > 0.0), value, 0.0)
 
 
-def _is_enabled(material: Material, ctx: Any, wi: Any, wo: Any) -> Any:
+def _is_enabled(material: PluginMaterial, ctx: Any, wi: Any, wo: Any) -> Any:
     """Whether a context enables the component that scatters light from wi to wo."""
     reflects = ctx.is_enabled(mi.BSDFFlags.GlossyReflection, 0)
     passes = material.is_open and ctx.is_enabled(mi.BSDFFlags.GlossyTransmission, 1)
     return dr.select(wi.z * wo.z > 0.0, mi.Bool(reflects), mi.Bool(passes))
 
 
-def _null_probability(material: Material, ctx: Any, si: Any) -> Any:
+def _null_probability(material: PluginMaterial, ctx: Any, si: Any) -> Any:
     """Share of samples that pass through without scattering."""
     if not (material.has_null and ctx.is_enabled(mi.BSDFFlags.Null, 2)):
         return mi.Float(0.0)

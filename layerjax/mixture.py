@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from layerjax._checks import in_short, require_key
+from layerjax._checks import abbreviate, require_key
 from layerjax._diagram import diagram_column
 from layerjax._parameters import RANGES, Parameter, as_floating, check_range, is_placeholder
 from layerjax._repr import ReprModule, format_value
@@ -52,10 +52,10 @@ class Mixture(ReprModule):
 
     def __init__(self, parts: Mapping[str, "Stack | Mixture"], weights: Sequence[Parameter] | Mapping[str, Parameter]):
         if not isinstance(parts, Mapping):
-            raise ValueError(f"{_PARTS}: {in_short(parts)} is not a dictionary of stacks by name")
+            raise ValueError(f"{_PARTS}: {abbreviate(parts)} is not a dictionary of stacks by name")
         if not isinstance(weights, Mapping | Sequence | np.ndarray | jax.Array) or isinstance(weights, str):
             raise ValueError(
-                f"{WEIGHTS}: {in_short(weights)} is not a list of shares, nor a dictionary of them by name"
+                f"{WEIGHTS}: {abbreviate(weights)} is not a list of shares, nor a dictionary of them by name"
             )
         for name in parts:
             if not (isinstance(name, str) and _NAME.fullmatch(name)) or name in _RESERVED:
@@ -69,7 +69,7 @@ class Mixture(ReprModule):
     def __check_init__(self) -> None:
         for name, part in self.parts.items():
             if not isinstance(part, Stack | Mixture):
-                raise ValueError(f"{_PARTS}[{name!r}]: {in_short(part)} is not a Stack or a Mixture")
+                raise ValueError(f"{_PARTS}[{name!r}]: {abbreviate(part)} is not a Stack or a Mixture")
         _check_sum(self.weights)
         channel_count(self)
 
@@ -133,7 +133,7 @@ def require_material(stack: object, *others: type) -> None:
         hint = "; a surface alone is Stack([], base=surface)"
     elif isinstance(stack, Interface | Medium | TurbidMedium):
         hint = "; a layer alone is Stack([layer])"
-    raise ValueError(f"stack: {in_short(stack)} is not a {kinds}{hint}")
+    raise ValueError(f"stack: {abbreviate(stack)} is not a {kinds}{hint}")
 
 
 def stacks_of(material: Stack | Mixture) -> list[Stack]:

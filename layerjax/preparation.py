@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 
 from layerjax import transport as transports
-from layerjax._checks import in_short
+from layerjax._checks import abbreviate
 from layerjax._numerics import allow_broadcasting
 from layerjax._parameters import cast_arrays
 from layerjax._shapes import channel_count, require_single
@@ -20,7 +20,7 @@ from layerjax.stack import Stack, require_numbers, simplify_and_name
 from layerjax.transport import Transport
 from layerjax.transport.adding_doubling import AddingDoubling
 from layerjax.transport.automatic import automatic
-from layerjax.transport.known_directions import Known, KnownDirections, known_directions
+from layerjax.transport.known_directions import DirectionLookup, KnownDirections, known_directions
 
 
 class Prepared(eqx.Module):
@@ -93,7 +93,9 @@ def transport_for(stack: Stack | Mixture, transport: Any, known: KnownDirections
     return _finest(solvers) if solvers else found[0]
 
 
-def ensure_prepared(stack: Stack | Prepared, transport: Any, dtype: jnp.dtype, known: Known = lambda: None) -> Prepared:
+def ensure_prepared(
+    stack: Stack | Prepared, transport: Any, dtype: jnp.dtype, known: DirectionLookup = lambda: None
+) -> Prepared:
     """A stack, prepared or not, for directions of this floating type, of which this is known."""
     prepared = stack if isinstance(stack, Prepared) else prepare_for_directions(stack, transport, known)
     return cast_arrays(prepared, dtype)
@@ -109,7 +111,7 @@ def ensure_prepared_for_albedo(stack: Stack | Prepared, transport: Any, dtype: j
     return cast_arrays(stack, dtype)
 
 
-def prepare_for_directions(stack: Stack, transport: Any, known: Known) -> Prepared:
+def prepare_for_directions(stack: Stack, transport: Any, known: DirectionLookup) -> Prepared:
     """`prepare` for values at directions of which this is known."""
     known = cache(known)
     require_numbers(stack)
@@ -118,13 +120,13 @@ def prepare_for_directions(stack: Stack, transport: Any, known: Known) -> Prepar
     return Prepared(chosen.prepare_for_directions(simplified, known), chosen, channel_count(stack))
 
 
-def resolve_transport(stack: Stack, transport: Any, known: Known | None) -> tuple[Transport, Stack]:
+def resolve_transport(stack: Stack, transport: Any, known: DirectionLookup | None) -> tuple[Transport, Stack]:
     """The transport with nothing left open, and the simplified stack; known is None: for energies."""
     require_numbers(stack)
     simplified, names = simplify_and_name(stack)
     chosen = automatic(stack, simplified) if isinstance(transport, str) and transport == "auto" else transport
     if not isinstance(chosen, Transport):
-        raise ValueError(f'transport: {in_short(transport)} is not a Transport or "auto"{_suggestion(transport)}')
+        raise ValueError(f'transport: {abbreviate(transport)} is not a Transport or "auto"{_suggestion(transport)}')
     chosen.check(simplified, names)
     chosen = (
         chosen.resolve_options_for_albedo(simplified) if known is None else chosen.resolve_options(simplified, known)

@@ -12,8 +12,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from layerjax._checks import in_short
-from layerjax._diagram import Row, diagram
+from layerjax._checks import abbreviate
+from layerjax._diagram import DiagramRow, diagram
 from layerjax._numerics import safe_div
 from layerjax._parameters import Parameter, is_placeholder, leaves_with_names, parameter
 from layerjax._repr import ReprModule, describe
@@ -119,7 +119,7 @@ class TurbidMedium(ReprModule):
 def _check_phase(owner: str, phase: Any) -> None:
     if not isinstance(phase, PhaseFunction):
         raise ValueError(
-            f"{owner}.phase: {in_short(phase)} is not a HenyeyGreenstein, an SGGX or another PhaseFunction"
+            f"{owner}.phase: {abbreviate(phase)} is not a HenyeyGreenstein, an SGGX or another PhaseFunction"
         )
 
 
@@ -143,7 +143,7 @@ class Stack(ReprModule):
 
     def __init__(self, layers: Iterable[Interface | Medium | TurbidMedium], base: Surface | None = None):
         if not isinstance(layers, Iterable) or isinstance(layers, str | Mapping):
-            raise ValueError(f"Stack.layers: {in_short(layers)} is not a list of Interface, Medium and TurbidMedium")
+            raise ValueError(f"Stack.layers: {abbreviate(layers)} is not a list of Interface, Medium and TurbidMedium")
         self.layers = cast(tuple[Interface | Medium, ...], tuple(layers))
         self.base = base
 
@@ -151,10 +151,10 @@ class Stack(ReprModule):
         for index, layer in enumerate(self.layers):
             if not isinstance(layer, Interface | Medium | TurbidMedium):
                 raise ValueError(
-                    f"Stack.layers[{index}]: {in_short(layer)} is not an Interface, a Medium or a TurbidMedium"
+                    f"Stack.layers[{index}]: {abbreviate(layer)} is not an Interface, a Medium or a TurbidMedium"
                 )
         if self.base is not None and not isinstance(self.base, Surface):
-            raise ValueError(f"Stack.base: {in_short(self.base)} is not a surface or None")
+            raise ValueError(f"Stack.base: {abbreviate(self.base)} is not a surface or None")
         channel_count(self)
 
     @property
@@ -164,11 +164,11 @@ class Stack(ReprModule):
 
     def _repr_html_(self) -> str:
         rows = [
-            Row("interface" if isinstance(layer, Interface) else "medium", type(layer).__name__, describe(layer))
+            DiagramRow("interface" if isinstance(layer, Interface) else "medium", type(layer).__name__, describe(layer))
             for layer in self.layers
         ]
         last = "no base: light passes" if self.base is None else type(self.base).__name__
-        rows.append(Row("nothing" if self.base is None else "base", last, describe(self.base)))
+        rows.append(DiagramRow("nothing" if self.base is None else "base", last, describe(self.base)))
         return diagram(rows, f"A stack, from top to bottom: {', '.join(row.name for row in rows)}")
 
 

@@ -34,7 +34,7 @@ from fits.sampling.initial import normal_draws
 from fits.sampling.mixture import Mixture
 from fits.sampling.options import MAX_PARETO_K
 from fits.sampling.posterior import Posterior
-from layerjax._checks import in_short, require_count, require_kind, require_number, require_seed
+from layerjax._checks import abbreviate, require_count, require_kind, require_number, require_seed
 from layerjax.compiling import program_cache
 
 # quantiles of a `Summary`: the ends of the central 50 % and 95 % intervals, and the median
@@ -269,7 +269,7 @@ def predict(
     require_kind("at", at, Geometry, Measurements, fix=TO_HAVE_THEM)
     if not isinstance(fitted, Fit | Posterior):
         if isinstance(fitted, type) or not hasattr(fitted, "predict"):
-            raise ValueError(f"fitted: {in_short(fitted)} is not a Fit, a Posterior or an Average")
+            raise ValueError(f"fitted: {abbreviate(fitted)} is not a Fit, a Posterior or an Average")
         return fitted.predict(at, draws=draws, seed=seed)
     return posterior_predictive(fitted, at, draws=draws, seed=seed)
 

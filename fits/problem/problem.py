@@ -34,7 +34,7 @@ from fits.problem.instrument import Instrument, optics_of, setting_of
 from fits.problem.model import JointModel, Linearisation, Model, Parts, Transport, linearise, predict_each
 from fits.problem.noise import Levels, Noise, is_assumed, noise_levels, require_size
 from fits.problem.parameters import Box, Free, LogNormal, Normal, is_free, names_of, require_in_range, split
-from layerjax._checks import in_short, require_choice, require_kind, require_number
+from layerjax._checks import abbreviate, require_choice, require_kind, require_number
 from layerjax._parameters import plain_name
 from layerjax._shapes import channel_count
 from layerjax.mixture import require_material
@@ -427,7 +427,7 @@ def _require_kinds(problem: Problem) -> None:
     if isinstance(problem.transport, str | lj.Transport):
         require_material(problem.stack)
     elif not callable(problem.transport):  # a function takes any stack
-        raise ValueError(f'transport: {in_short(problem.transport)} is not a Transport or "auto", nor a function')
+        raise ValueError(f'transport: {abbreviate(problem.transport)} is not a Transport or "auto", nor a function')
     require_kind("data", problem.data, Measurements, fix=TO_HAVE_THEM)
     require_kind("noise", problem.noise, Noise)
     require_kind("instrument", problem.instrument, Instrument, None)

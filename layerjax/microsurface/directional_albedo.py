@@ -37,7 +37,7 @@ from jax import Array
 from jax.typing import ArrayLike
 
 from layerjax import fresnel
-from layerjax._numerics import at_least, at_most
+from layerjax._numerics import clamp_max, clamp_min
 from layerjax.microsurface.multiple_bounces import interface_multiple_reflectance
 from layerjax.microsurface.visible_facets import (
     Cap,
@@ -52,13 +52,13 @@ from layerjax.microsurface.visible_facets import (
 
 POINTS = 12
 
-SMOOTH = 1e-4
+SMOOTH_ALPHA = 1e-4
 """The least width. Of a surface known to be so narrow the energies are Fresnel's, and no quadrature is needed."""
 
 
 def is_smooth(alpha: Any) -> bool:
-    """Whether a width is known while tracing to be `SMOOTH`."""
-    return not isinstance(alpha, jax.core.Tracer) and bool(np.all(np.asarray(alpha) <= SMOOTH))
+    """Whether a width is known while tracing to be `SMOOTH_ALPHA`."""
+    return not isinstance(alpha, jax.core.Tracer) and bool(np.all(np.asarray(alpha) <= SMOOTH_ALPHA))
 
 
 @partial(jax.jit, static_argnames=("multiple", "points"))
@@ -117,7 +117,7 @@ def first_event(
     upper = split_facets(cap, cone(cap, jnp.ones_like(cosine)), refraction_region(cap, ior), points)
     first = upper.mean(fresnel.dielectric(upper.facing, ior[..., None, None]) * escape(upper))
     crossing, transmitted = _refracted_energies(cap, ior, points)
-    return first, at_least(1.0 - crossing - first, 0.0), at_least(crossing - transmitted, 0.0)
+    return first, clamp_min(1.0 - crossing - first, 0.0), clamp_min(crossing - transmitted, 0.0)
 
 
 def first_mirror(
@@ -129,7 +129,7 @@ def first_mirror(
     upper, seen = reflection_region(cap, points), region_facets(cap, whole_region(cap), points)
     levels = [fresnel.conductor(part.facing, ior[..., None, None], k[..., None, None]) for part in (upper, seen)]
     first = upper.mean(levels[0] * escape(upper))
-    return first, at_least(seen.mean(levels[1]) - first, 0.0)
+    return first, clamp_min(seen.mean(levels[1]) - first, 0.0)
 
 
 def _arrays(*values: ArrayLike) -> list[Array]:
@@ -185,4 +185,4 @@ def escape(facets: Facets) -> Array:
 
 def _share(x: Array) -> Array:
     """x, kept in [0, 1] against errors of quadrature and fit."""
-    return at_most(at_least(x, 0.0), 1.0)
+    return clamp_max(clamp_min(x, 0.0), 1.0)

@@ -32,7 +32,7 @@ import numpy as np
 from jax import Array
 
 from layerjax import channels, fresnel
-from layerjax._numerics import at_least, at_most, safe_sqrt
+from layerjax._numerics import clamp_max, clamp_min, safe_sqrt
 from layerjax.channels import Channels, map_channels
 from layerjax.microsurface.splines import read
 from layerjax.tables import load
@@ -63,7 +63,7 @@ LEAST_ALPHA = 1e-4
 STEEPEST = 0.9685
 """The largest critical cosine: that of the largest index."""
 
-MOST = 6.0
+LARGEST_ATANH = 6.0
 """Bound of the inverse hyperbolic tangent of twice a share less 1."""
 
 
@@ -102,7 +102,7 @@ def interface_energies(cosine: Array, alpha: Array, ior: Array, multiple: bool) 
         return reflected, 1.0 - reflected
     root, passed = _dielectric(cosine, alpha, ior, 1, 2)
     reflected = _from_root(root) * mirror_energy(cosine, alpha)
-    return reflected, at_most(at_least(passed, 0.0), 1.0 - reflected)
+    return reflected, clamp_max(clamp_min(passed, 0.0), 1.0 - reflected)
 
 
 def single_reflectance(cosine: Array, alpha: Array, ior: Array) -> Array:
@@ -112,7 +112,7 @@ def single_reflectance(cosine: Array, alpha: Array, ior: Array) -> Array:
 
 def mirror_energy(cosine: Array, alpha: Array) -> Array:
     """Reflectance of rough facets that reflect all, single scattering."""
-    return at_most(_read_plane(cosine, alpha, "mirror", 1)[0], 1.0)
+    return clamp_max(_read_plane(cosine, alpha, "mirror", 1)[0], 1.0)
 
 
 def conductor_energies(cosine: Array, alpha: Array, ior: Channels, k: Channels, multiple: bool) -> Channels:
@@ -125,7 +125,7 @@ def conductor_energies(cosine: Array, alpha: Array, ior: Channels, k: Channels, 
     if not multiple:
         total, *facing = _read_plane(cosine, alpha, "mirror", 1 + len(SLICES))
         (levels,) = _means_of_facets(facing, (SLICES,), ior, k)
-        return channels.multiply((at_most(total, 1.0),), levels)
+        return channels.multiply((clamp_max(total, 1.0),), levels)
     total, *rest = _read_plane(cosine, alpha, "first", 1 + len(SLICES) + len(REST) + RETURNS)
     facing, returns = rest[:-RETURNS], rest[-RETURNS:]
     first, sent_on = _means_of_facets(facing, (SLICES, REST), ior, k)
@@ -133,11 +133,11 @@ def conductor_energies(cosine: Array, alpha: Array, ior: Channels, k: Channels, 
     # by itself: of one metal it is the same in all directions
     smooth = [jnp.asarray(u, total.dtype) for u in (*cosines, 1.0)]
     mean, normal = _means_of_facets(smooth, (weights, (1.0,)), ior, k)
-    total = at_most(total, 1.0)
+    total = clamp_max(total, 1.0)
 
     def reflected(first: Array, sent_on: Array, mean: Array, normal: Array) -> Array:
         more = (1.0 - total) * sent_on * multiple_reflectance(returns, mean, normal)
-        return at_most(at_least(total * first + more, 0.0), 1.0)
+        return clamp_max(clamp_min(total * first + more, 0.0), 1.0)
 
     return map_channels(reflected, first, sent_on, mean, normal)
 
@@ -230,7 +230,7 @@ def _means_of_facets(
 
     def add(sums: list[Channels], tabulated: tuple[Array, Array]) -> tuple[list[Channels], None]:
         u, shares = tabulated
-        levels = map_channels(lambda ior, k: fresnel.conductor(at_most(at_least(u, 0.0), 1.0), ior, k), ior, k)
+        levels = map_channels(lambda ior, k: fresnel.conductor(clamp_max(clamp_min(u, 0.0), 1.0), ior, k), ior, k)
         after = []
         for total, share in zip(sums, shares, strict=True):
             after.append(tuple(before + share * level for before, level in zip(total, levels, strict=True)))
@@ -244,7 +244,7 @@ def _means_of_facets(
 
 
 def _from_root(root: Array) -> Array:
-    return at_most(at_least(root * root - ENERGY_OFFSET, 0.0), 1.0)
+    return clamp_max(clamp_min(root * root - ENERGY_OFFSET, 0.0), 1.0)
 
 
 def _width(warp: Warp, alpha: Array) -> Array:
@@ -260,7 +260,7 @@ def _cosine_place(cosine: Array, critical: Array, width: Array) -> Array:
 def _alpha_place(alpha: Array, grain: float) -> Array:
     if grain:
         return jnp.arcsinh(alpha * (1.0 / grain)) * (1.0 / math.asinh(1.0 / grain))
-    return 1.0 - jnp.log(at_least(alpha, LEAST_ALPHA)) * (1.0 / math.log(LEAST_ALPHA))
+    return 1.0 - jnp.log(clamp_min(alpha, LEAST_ALPHA)) * (1.0 / math.log(LEAST_ALPHA))
 
 
 def cosine_of_place(place: np.ndarray, critical: np.ndarray, width: np.ndarray) -> np.ndarray:

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from layerjax._numerics import allow_broadcasting, at_least, at_most, horner, unstack
+from layerjax._numerics import allow_broadcasting, clamp_max, clamp_min, horner, unstack
 
 BASIS = np.array([[1.0, -3.0, 3.0, -1.0], [4.0, 0.0, -6.0, 3.0], [1.0, 3.0, 3.0, -3.0], [0.0, 0.0, 0.0, 1.0]]) / 6.0
 """Weights of the four coefficients that count at a place: of each the polynomial in how far it is beyond the first."""
@@ -47,8 +47,8 @@ def taps(place: Array, count: Array | int) -> tuple[Array, Array, Array]:
     The distance is in steps, so many of which the axis has.
     """
     steps = jnp.asarray(count - 3, place.dtype)
-    x = at_most(at_least(place, 0.0), 1.0) * steps
-    first = at_most(jnp.floor(x), steps - 1.0)
+    x = clamp_max(clamp_min(place, 0.0), 1.0) * steps
+    first = clamp_max(jnp.floor(x), steps - 1.0)
     return first.astype(jnp.int32), x - first, steps
 
 

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from layerjax._numerics import at_least, at_most, safe_sqrt
+from layerjax._numerics import clamp_max, clamp_min, safe_sqrt
 from layerjax.quadrature import gauss_legendre, panels
 
 UPRIGHT = 1e-6
@@ -77,7 +77,7 @@ class Facets(NamedTuple):
 
 def make_cap(cosine: Array, alpha: Array) -> Cap:
     """The cap of facets seen at `cosine` > 0; both arrays of one shape."""
-    sine = jnp.sqrt(at_least((1.0 - cosine) * (1.0 + cosine), 0.0) + UPRIGHT * cosine * cosine)
+    sine = jnp.sqrt(clamp_min((1.0 - cosine) * (1.0 + cosine), 0.0) + UPRIGHT * cosine * cosine)
     cosine = cosine * float(np.sqrt(1.0 - UPRIGHT))
     x = alpha * sine
     stretch = jnp.sqrt(x * x + cosine * cosine)
@@ -115,7 +115,7 @@ def refraction_region(cap: Cap, ior: Array) -> Region:
         tall = c * (height / cap.stretch) ** 2 * (1.0 - cap.alpha) * (1.0 + cap.alpha)
         return facing - half - safe_sqrt(half * half + tall), cap.vx * s
 
-    return Region((_polar(cap, at_most(cap.angle + critical, 0.5 * jnp.pi)), _polar(cap, cap.angle - critical)), cut)
+    return Region((_polar(cap, clamp_max(cap.angle + critical, 0.5 * jnp.pi)), _polar(cap, cap.angle - critical)), cut)
 
 
 def whole_region(cap: Cap) -> Region:
@@ -139,11 +139,11 @@ def region_facets(cap: Cap, region: Region, points: int) -> Facets:
 def split_facets(cap: Cap, region: Region, inner: Region, points: int) -> Facets:
     """Points in a region, split where another one ends."""
     low, high = _sort_pair(region.touches)
-    edges = jnp.sort(jnp.stack([low, high, *(at_most(touch, high) for touch in inner.touches)], axis=-1), axis=-1)
+    edges = jnp.sort(jnp.stack([low, high, *(clamp_max(touch, high) for touch in inner.touches)], axis=-1), axis=-1)
     t, w = _circles(cap, tuple(jnp.moveaxis(edges, -1, 0)), points)
     start, end = _arc(*region.cut(cap.inner(), t))
     _, between = _arc(*inner.cut(cap.inner(), t))
-    between = at_least(at_most(between, end), start)
+    between = clamp_min(clamp_max(between, end), start)
     near = _facets(cap, t, w, start, between, _graded_nodes, _azimuths(points))
     rest = _facets(cap, t, w, between, end, _even, _azimuths(points))
     joined = (jnp.concatenate(parts, axis=-1) for parts in zip(near[2:], rest[2:], strict=True))
@@ -166,7 +166,7 @@ _even = gauss_legendre
 def _polar(cap: Cap, angle: Array) -> Array:
     """t of the facet in the plane of incidence at this angle from the normal, towards wi."""
     stretched = jnp.arctan2(jnp.sin(angle), cap.alpha * jnp.cos(angle))
-    return at_most(jnp.abs(2.0 * stretched - cap.tilt), jnp.pi - cap.tilt)
+    return clamp_max(jnp.abs(2.0 * stretched - cap.tilt), jnp.pi - cap.tilt)
 
 
 def _sort_pair(pair: tuple[Array, Array]) -> tuple[Array, Array]:

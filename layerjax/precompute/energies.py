@@ -40,7 +40,7 @@ Report = Callable[[str], Any]
 
 POINTS = 24
 """Nodes from pole to rim of the cap of facets."""
-AT_ONCE = 4096
+BATCH_SIZE = 4096
 METALS, LEAST_K, TOLERATED = 150, 0.3, 1e-3
 """That shares are fitted to, their least k, and the error of energy that counts as one of the usual numbers."""
 NEXT = 0.03
@@ -181,11 +181,13 @@ def escape_cones(dense: float) -> Values:
         arguments = np.broadcast_arrays(np.clip(cosine, LEAST_COSINE, 1.0), alpha, ratio)
         share = map_batches(lambda c, a, r: (by_quadrature.escape_cone_share(c, a, r, points=POINTS),), *arguments)[0]
         with np.errstate(divide="ignore"):
-            return np.clip(np.arctanh(2.0 * share - 1.0), -tables.MOST, tables.MOST)
+            return np.clip(np.arctanh(2.0 * share - 1.0), -tables.LARGEST_ATANH, tables.LARGEST_ATANH)
 
     # linear beyond the normal, as splines are inaccurate at ends
     upright, beside = odds(np.ones_like(beyond[:1])), odds(1.0 - NEXT * width)
-    further = np.clip(upright + (upright - beside) / (NEXT * width) * (beyond - 1.0), -tables.MOST, tables.MOST)
+    further = np.clip(
+        upright + (upright - beside) / (NEXT * width) * (beyond - 1.0), -tables.LARGEST_ATANH, tables.LARGEST_ATANH
+    )
     return fit_splines(np.where(beyond > 1.0, further, odds(beyond)), SHAPES["retained"]).ravel()
 
 
@@ -195,7 +197,7 @@ def map_batches(function: Callable[..., tuple[Array, ...]], *arguments: Values) 
     flat = [argument.ravel() for argument in arguments]
     compiled = jax.jit(function)
     rows = []
-    for start in range(0, flat[0].size, AT_ONCE):
-        few = [jnp.asarray(np.resize(part[start : start + AT_ONCE], AT_ONCE)) for part in flat]
+    for start in range(0, flat[0].size, BATCH_SIZE):
+        few = [jnp.asarray(np.resize(part[start : start + BATCH_SIZE], BATCH_SIZE)) for part in flat]
         rows.append([np.asarray(value)[: flat[0].size - start] for value in compiled(*few)])
     return [np.concatenate(part).reshape(*shape, *part[0].shape[1:]) for part in zip(*rows, strict=True)]

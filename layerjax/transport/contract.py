@@ -21,7 +21,7 @@ from layerjax.channels import Channels, pick
 from layerjax.directions import UNIT_SLACK, Vector, dot, horizontal, select, split
 from layerjax.stack import Interface, Stack
 from layerjax.surfaces import Conductor
-from layerjax.transport.known_directions import Known
+from layerjax.transport.known_directions import DirectionLookup
 
 Side = Literal["all", "reflection", "transmission"]
 """Requested pairs: any; both directions above; one above and one below. Others give 0."""
@@ -68,7 +68,7 @@ class Transport(eqx.Module):
     def prepare(self, stack: Stack) -> Any:
         """All the work that no direction is needed for, of a simplified stack."""
 
-    def resolve_options(self, stack: Stack, known: Known) -> "Transport":
+    def resolve_options(self, stack: Stack, known: DirectionLookup) -> "Transport":
         """The same transport with all that it does not state chosen for the (simplified) stack and known directions."""
         return self
 
@@ -76,11 +76,11 @@ class Transport(eqx.Module):
         """`resolve_options` for albedos alone, which no narrow lobe needs a finer resolution for."""
         return self.resolve_options(stack, lambda: None)
 
-    def prepare_for_directions(self, stack: Stack, known: Known) -> Any:
+    def prepare_for_directions(self, stack: Stack, known: DirectionLookup) -> Any:
         """`prepare` for values at known directions alone, for transports to which these are of use."""
         return self.prepare(stack)
 
-    def traceable_equivalent(self, stack: Stack, known: Known) -> "Transport | None":
+    def traceable_equivalent(self, stack: Stack, known: DirectionLookup) -> "Transport | None":
         """What gives, within a program where all numbers of the simplified stack are traced, just what this one gives
         outside, and can be differentiated forward; None: nothing does. Directions are known, and the stack is but for
         what `grad` or its like differentiates by."""

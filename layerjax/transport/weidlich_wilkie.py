@@ -37,7 +37,7 @@ from layerjax.stack import Medium, Stack, is_known, optical_depths
 from layerjax.surfaces import Conductor, Surface
 from layerjax.transport.contract import TEXELS, DeterministicTransport, Side, refuse_vmf
 from layerjax.transport.first_order import ReflectingInterface
-from layerjax.transport.known_directions import Known
+from layerjax.transport.known_directions import DirectionLookup
 
 LEAST_SHARE = 0.02
 """Added to the energy of every lobe before they are drawn by it: none is missed where its estimate is 0."""
@@ -69,7 +69,7 @@ class WeidlichWilkie(DeterministicTransport):
     def prepare(self, stack: Stack) -> Stack:
         return stack
 
-    def traceable_equivalent(self, stack: Stack, known: Known) -> "WeidlichWilkie":
+    def traceable_equivalent(self, stack: Stack, known: DirectionLookup) -> "WeidlichWilkie":
         """Itself: no number decides what is computed."""
         return self
 

@@ -2,8 +2,8 @@
 
 Materials are drawn as those that second lobes are learned from, but without absorption, and narrow lobes with an axis
 are there as well: nothing has to be solved for them. Loss of a material: what is missing of the energy that several
-collisions leave, energy times the relative error of c, as a root mean square over directions of light, and `FAR` times
-its square.
+collisions leave, energy times the relative error of c, as a root mean square over directions of light, and
+`TAIL_WEIGHT` times its square.
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -28,7 +28,7 @@ from layerjax.transport.spongecake.mapping import Numbers
 SHARD = 256
 """Materials a shard, of one structure."""
 
-FAR = 8.0
+TAIL_WEIGHT = 8.0
 """Weight of the squared error beside the error itself, for the sake of the few that are far off."""
 
 RULE = Rule(nodes=12, cosines=6, azimuths=8, rounds=8)
@@ -122,7 +122,7 @@ def errors(net: eqx.nn.MLP, corrections: Corrections) -> Array:
 
 def _loss(net: eqx.nn.MLP, corrections: Corrections) -> Array:
     squares = jnp.mean(errors(net, corrections) ** 2, axis=-1)
-    return jnp.mean(jnp.sqrt(squares + 1e-8) + FAR * squares)
+    return jnp.mean(jnp.sqrt(squares + 1e-8) + TAIL_WEIGHT * squares)
 
 
 def _root(net: eqx.nn.MLP, corrections: Corrections) -> Array:

@@ -26,7 +26,7 @@ SEED = 2022
 
 
 @dataclass(frozen=True)
-class Plan:
+class TrainingPlan:
     """How much is learned from and tested with, and for how long. Materials by the number of their media: one, two."""
 
     train: tuple[int, int]
@@ -35,14 +35,14 @@ class Plan:
 
 
 PLANS = {
-    False: Plan((4096, 4608), (640, 512), Schedule()),
-    True: Plan((64, 64), (32, 32), Schedule(epochs=20, batch=16)),
+    False: TrainingPlan((4096, 4608), (640, 512), Schedule()),
+    True: TrainingPlan((64, 64), (32, 32), Schedule(epochs=20, batch=16)),
 }
 """By whether the networks are coarse: of second lobes."""
 
 CORRECTION_PLANS = {
-    False: Plan((30720, 30720), (2048, 2048), Schedule(epochs=150, batch=128)),
-    True: Plan((256, 256), (256, 256), Schedule(epochs=10, batch=32)),
+    False: TrainingPlan((30720, 30720), (2048, 2048), Schedule(epochs=150, batch=128)),
+    True: TrainingPlan((256, 256), (256, 256), Schedule(epochs=10, batch=32)),
 }
 """And of what puts their energy right."""
 
@@ -71,7 +71,7 @@ def make(coarse: bool = False, work: Path = Path("spongecake-data"), report: Rep
     return table
 
 
-def _second_lobe(media: int, plan: Plan, work: Path, report: Report) -> tuple[eqx.nn.MLP, dict[str, NDArray]]:
+def _second_lobe(media: int, plan: TrainingPlan, work: Path, report: Report) -> tuple[eqx.nn.MLP, dict[str, NDArray]]:
     """The network, and its numbers and record by name."""
     count, tested, schedule = plan.train[media - 1], plan.test[media - 1], plan.schedule
     splits: tuple[tuple[Split, int], ...] = (("train", count), ("test", tested))
@@ -93,7 +93,9 @@ def _second_lobe(media: int, plan: Plan, work: Path, report: Report) -> tuple[eq
     return net, pack(net) | _record(media, plan, curve, error)
 
 
-def _energy_correction(media: int, net: eqx.nn.MLP, plan: Plan, work: Path, report: Report) -> dict[str, NDArray]:
+def _energy_correction(
+    media: int, net: eqx.nn.MLP, plan: TrainingPlan, work: Path, report: Report
+) -> dict[str, NDArray]:
     """Numbers and record by name of the network that puts the energy of another right."""
     count, tested = plan.train[media - 1], plan.test[media - 1]
     own = work / f"{hashlib.sha256(b''.join(part.tobytes() for part in pack(net).values())).hexdigest()[:12]}"
@@ -115,7 +117,7 @@ def _energy_correction(media: int, net: eqx.nn.MLP, plan: Plan, work: Path, repo
     return pack(network) | _record(media, plan, curve, error)
 
 
-def _record(media: int, plan: Plan, curve: NDArray, error: NDArray) -> dict[str, NDArray]:
+def _record(media: int, plan: TrainingPlan, curve: NDArray, error: NDArray) -> dict[str, NDArray]:
     schedule = plan.schedule
     return {
         "materials": np.asarray((plan.train[media - 1], plan.test[media - 1])),
@@ -125,6 +127,6 @@ def _record(media: int, plan: Plan, curve: NDArray, error: NDArray) -> dict[str,
     }
 
 
-def _state(media: int, plan: Plan) -> str:
+def _state(media: int, plan: TrainingPlan) -> str:
     """Name of the file that a training resumes from."""
     return f"state-{media}-{SEED}-{plan.train[media - 1]}-{plan.schedule.epochs}-{plan.schedule.batch}.eqx"

@@ -13,7 +13,7 @@ from jax import Array
 from jax.typing import ArrayLike
 
 from layerjax._checks import require_choice
-from layerjax._numerics import at_least, at_most, safe_div, safe_sqrt
+from layerjax._numerics import clamp_max, clamp_min, safe_div, safe_sqrt
 from layerjax._parameters import Parameter, is_placeholder, parameter
 from layerjax.channels import per_channel
 from layerjax.directions import Vector, add, combine, dot, frame, normalize, scale, select
@@ -81,7 +81,7 @@ class VMFDiffuse(Surface):
 
     def pdf(self, wi: Vector, wo: Vector) -> Array:
         share, axis = self._proposal(wi)
-        return (0.5 * share + (1.0 - share) * at_least(dot(axis, wo), 0.0)) / jnp.pi
+        return (0.5 * share + (1.0 - share) * clamp_min(dot(axis, wo), 0.0)) / jnp.pi
 
     def _proposal(self, wi: Vector) -> tuple[Array, Vector]:
         """Share of uniform draws, and the axis of the lobe of the others."""
@@ -139,4 +139,4 @@ def _solve_albedo(target: VMFDiffuse) -> Array:
     # one step of Newton's method carries the derivatives
     slope = jax.jvp(lambda c: energy(c, r), (near,), (jnp.ones_like(near),))[1]
     found = near + (wanted - energy(near, r)) / jax.lax.stop_gradient(slope)
-    return at_most(at_least(found, 0.0), 1.0).reshape(target.albedo.shape)
+    return clamp_max(clamp_min(found, 0.0), 1.0).reshape(target.albedo.shape)

@@ -40,7 +40,7 @@ EDGE = 7.5
 """Times the distance between rays: half the width over which the end of a lobe is rounded off, at facets that stand
 upright. Else values would change by steps of up to 3e-4 as an index moves rays across it."""
 
-AT_ONCE = 1 << 17
+BATCH_RAYS = 1 << 17
 """Rays that are followed together."""
 
 TINY = 1e-18
@@ -55,7 +55,7 @@ class Ballistic(eqx.Module):
     media: tuple[tuple[Medium, ...], tuple[Medium, ...], tuple[Medium, ...]]
 
 
-class Lobe(NamedTuple):
+class BTDFLobe(NamedTuple):
     """A BTDF, continued beyond the facets that stand upright, and ended there: only the first has smooth weights."""
 
     continued: Array
@@ -138,7 +138,7 @@ def evaluate_ballistic(state: Ballistic, wi: Vector, wo: Vector) -> Channels:
         return jax.lax.cond(jnp.any(crossing), passed, nothing, *pairs)
 
     rays = rows[0].size * 8 * POINTS[0] * POINTS[1]
-    found = map_row_chunks(some, rows, rays // AT_ONCE)
+    found = map_row_chunks(some, rows, rays // BATCH_RAYS)
     outside = total(
         [*optical_depths(state.media[0], over), *optical_depths(state.media[2], flip(under)), (0.0 * over[2],)]
     )
@@ -168,13 +168,13 @@ def _transmitted_bsdf(state: Ballistic, cosine_i: Array, cosine_o: Array, azimut
         EDGE * facet_spacing(POINTS[0], facets) * jnp.abs(1.0 - n) for n, facets in zip(ratios, faces, strict=True)
     ]
 
-    def parts(x: Array, y: Array, z: Array) -> tuple[Lobe, Lobe, Channels]:
+    def parts(x: Array, y: Array, z: Array) -> tuple[BTDFLobe, BTDFLobe, Channels]:
         """g_i, g_o / n_below^2 and what media pass, of travel along (x, y, -z) between the interfaces."""
         middle: Vector = (-x, -y, z)
         g_i = _lobe((x, y, z), over, ratios[0], faces[0], edges[1])
         g_o = _lobe(middle, under, ratios[1], faces[1], edges[0])
         depths = total([*optical_depths(state.media[1], middle), (jnp.zeros_like(z),)])
-        return g_i, Lobe(*(part / below**2 for part in g_o)), tuple(jnp.exp(-depth) for depth in depths)
+        return g_i, BTDFLobe(*(part / below**2 for part in g_o)), tuple(jnp.exp(-depth) for depth in depths)
 
     # a BTDF at equal indices is a delta: then the rays of that side are the whole
     delta_i, delta_o = is_index_matched(inner), is_index_matched(inner / below)
@@ -190,12 +190,12 @@ def _transmitted_bsdf(state: Ballistic, cosine_i: Array, cosine_o: Array, azimut
     return total([from_above, from_below])
 
 
-def _lobe(wi: Vector, wo: Vector, ratio: Array, facets: Normals, edge: Array) -> Lobe:
+def _lobe(wi: Vector, wo: Vector, ratio: Array, facets: Normals, edge: Array) -> BTDFLobe:
     value, height = continued_transmission(wi, wo, ratio, *facets)
-    return Lobe(value, value * smooth_step(height / (edge + TINY)))
+    return BTDFLobe(value, value * smooth_step(height / (edge + TINY)))
 
 
-def _weight(one: Lobe, other: Lobe) -> Array:
+def _weight(one: BTDFLobe, other: BTDFLobe) -> Array:
     return one.continued / (one.continued + other.continued + TINY)
 
 

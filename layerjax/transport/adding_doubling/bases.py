@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from layerjax import fresnel
-from layerjax._numerics import at_least, safe_div
+from layerjax._numerics import clamp_min, safe_div
 from layerjax.channels import per_channel, pick
 from layerjax.directions import Vector, reflect
 from layerjax.surfaces import Conductor, Surface
@@ -53,7 +53,7 @@ def _conductor(region: Region, base: Conductor, kernels: Sequence[Array], multip
 
 def _coloured_return(energy: Array, lossless: Array, weight: Array) -> Array:
     """What a conductor returns of the light lost to masking: it loses its Fresnel share at every further facet."""
-    lost = jnp.where(weight > 0, at_least(1.0 - lossless, 0.0), 0.0)
+    lost = jnp.where(weight > 0, clamp_min(1.0 - lossless, 0.0), 0.0)
     total = jnp.sum(weight * lost)
     # mean reflectance of a facet, and mean share that escapes at each try (Kulla & Conty 2017)
     level = safe_div(jnp.sum(weight * energy), jnp.sum(weight * lossless))

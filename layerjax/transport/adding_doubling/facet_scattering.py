@@ -13,10 +13,10 @@ from jax import Array
 
 from layerjax import fresnel
 from layerjax._batching import map_row_chunks
-from layerjax._numerics import at_least, at_most, safe_sqrt
+from layerjax._numerics import clamp_max, clamp_min, safe_sqrt
 from layerjax.directions import Vector, combine, dot, normalize, reflect, sanitise
 from layerjax.normals import facets
-from layerjax.normals.facet_rule import Parallels, Way, parallels, polar_angles, visible_normals
+from layerjax.normals.facet_rule import FacetEvent, Parallels, parallels, polar_angles, visible_normals
 from layerjax.quadrature import gauss_legendre
 from layerjax.transport.adding_doubling.grid import Grid, Region
 
@@ -43,7 +43,7 @@ def facet_energies(near: Region, far: Region, normals: Normals) -> tuple[Array, 
     reflected = reflected_energy(near, far.ior / near.ior, normals)
     _, passed = refracted_rays(near, far.ior / near.ior, normals, ENERGY_POINTS)
     # by quadrature it may be a little more than there is
-    refracted = at_most(jnp.sum(passed, axis=-1), 1.0 - reflected)
+    refracted = clamp_max(jnp.sum(passed, axis=-1), 1.0 - reflected)
     return reflected, refracted, jnp.where(near.exists, 1.0 - reflected - refracted, 0.0)
 
 
@@ -65,20 +65,25 @@ def refracted_rays(region: Region, ratio: Array, normals: Normals, points: tuple
 
 
 def map_visible_normals(
-    function: Callable[..., Any], region: Region, normals: Normals, ratio: Array, way: Way, points: tuple[int, int]
+    function: Callable[..., Any],
+    region: Region,
+    normals: Normals,
+    ratio: Array,
+    event: FacetEvent,
+    points: tuple[int, int],
 ) -> Any:
     """function(m, m . wi, weights, wi) of the normals seen from the nodes, (nodes, points); see `visible_normals`."""
     alpha, kind = jnp.asarray(normals.alpha, region.cosine.dtype), normals.distribution
 
     def of_nodes(rows: tuple[Array, ...]) -> Any:
-        cosine, sine, *at = rows
+        cosine, sine, *circles = rows
         wi: Vector = (-sine[:, None], jnp.zeros_like(sine[:, None]), cosine[:, None])
-        return function(*visible_normals(cosine, sine, Parallels(*at), alpha, kind, points[1]), wi)
+        return function(*visible_normals(cosine, sine, Parallels(*circles), alpha, kind, points[1]), wi)
 
-    polar = polar_angles(region.cosine, region.sine, alpha, kind, ratio, way, points[0])
+    polar = polar_angles(region.cosine, region.sine, alpha, kind, ratio, event, points[0])
     # outside of the loop: kept in memory, not computed again for each of the facets' numbers
-    at = parallels(region.cosine, region.sine, polar, alpha, kind, ratio, way)
-    return map_row_chunks(of_nodes, (region.cosine, region.sine, *at))
+    circles = parallels(region.cosine, region.sine, polar, alpha, kind, ratio, event)
+    return map_row_chunks(of_nodes, (region.cosine, region.sine, *circles))
 
 
 def _refract(
@@ -155,7 +160,7 @@ def _ggx_normals(grid: Grid, region: Region, width: Array, modes: int) -> tuple[
     weight = jnp.sin(polar) * (rim * w / (1.0 + v[2]))[:, :, None] * (jnp.ones_like(phi) / azimuth_facets)
     sine, cosine = jnp.sin(polar), jnp.cos(polar)
     x, y = v[0][:, :, None] + sine * jnp.cos(phi), sine * jnp.sin(phi)
-    z = at_least(v[2][:, :, None] + cosine, 0.0) * jnp.ones_like(phi)
+    z = clamp_min(v[2][:, :, None] + cosine, 0.0) * jnp.ones_like(phi)
     nodes = region.cosine.shape[0]
     flat = tuple(jnp.reshape(part, (nodes, -1)) for part in (alpha * x, alpha * y, z))
     return normalize((flat[0], flat[1], flat[2])), weight.reshape(nodes, -1), wi

@@ -16,7 +16,7 @@ from jax import Array
 
 from layerjax import fresnel
 from layerjax._batching import map_row_chunks
-from layerjax._numerics import at_least, at_most, safe_div, safe_sqrt
+from layerjax._numerics import clamp_max, clamp_min, safe_div, safe_sqrt
 from layerjax.directions import Vector, half_vector
 from layerjax.microsurface.directional_albedo import interface_energies
 from layerjax.surfaces.microfacet import mirror_lobe
@@ -44,13 +44,13 @@ STRONG = 5.0
 LEAST_POINTS = {"ggx": (12, 6), "vmf": (12, 8)}
 """Points a panel, and in azimuth, of light let in along few directions, at least, by the distribution of normals."""
 
-AT_ONCE = 1 << 20
+MOST_ENTRIES = 1 << 20
 """Numbers that arrays of facets hold at most."""
 
-ROUNDED = 0.01
+ROUNDING_SHARE = 0.01
 """Times the root of the precision: a share of energy below it is only what rounding leaves of tables."""
 
-RESOLVED = 0.2
+HALF_RESOLVED_WIDTH = 0.2
 """Times the distance between nodes: a lobe of this width, alpha times their number, is half resolved by them."""
 
 BLUR, BLUR_BETWEEN = 5.6, 2.5
@@ -195,7 +195,7 @@ def _requested_operators(
 
 
 def _unsampled_share(grid: Grid, normals: Normals) -> Array:
-    return 1.0 / (1.0 + (jnp.asarray(normals.alpha) * grid.nodes / RESOLVED) ** 4)
+    return 1.0 / (1.0 + (jnp.asarray(normals.alpha) * grid.nodes / HALF_RESOLVED_WIDTH) ** 4)
 
 
 def _blur(grid: Grid, near: Region, far: Region, normals: Normals) -> Array:
@@ -216,7 +216,7 @@ def _face(region: Region, energy: Array, ior: Array, normals: Normals, modes: in
 
     Light that two interfaces reflect totally would go back and forth for ever: a little is lost.
     """
-    energy = at_most(energy, 1.0 - LEAK * float(jnp.finfo(energy.dtype).eps))
+    energy = clamp_max(energy, 1.0 - LEAK * float(jnp.finfo(energy.dtype).eps))
 
     def reflection(wi: Vector, wo: Vector) -> list[Array]:
         h, cosine = half_vector(wi, wo, same_side=True)
@@ -241,7 +241,7 @@ def _critical_blur(wi: Vector, wo: Vector, ior: Array, azimuth: float, polar: fl
     squared = (CRITICAL * azimuth) ** 2 * (across * across + (azimuth * along) ** 2)
     if polar:
         cosine = along + wi[2] * wo[2]
-        squared = squared + (CRITICAL_KEPT * polar) ** 2 * at_least((1.0 - cosine) * (1.0 + cosine), 0.0)
+        squared = squared + (CRITICAL_KEPT * polar) ** 2 * clamp_min((1.0 - cosine) * (1.0 + cosine), 0.0)
     return jnp.sqrt(squared) / (2.0 * ior * ior)
 
 
@@ -270,7 +270,7 @@ def _deposit(grid: Grid, wo: Vector, share: Array, far: Region, near: Region, mo
         return spun @ weights
 
     rows, points = share.shape
-    chunks = points * max(modes, grid.size) * rows // AT_ONCE
+    chunks = points * max(modes, grid.size) * rows // MOST_ENTRIES
     flux = jnp.moveaxis(map_row_chunks(jax.vmap(deposit), (wo, share), chunks), 0, -1)
     flux = flux / jnp.where(odd[:, None], far.sine, 1.0)[:, :, None]
     return jnp.where(far.weight[:, None] > 0, flux, 0.0)
@@ -286,11 +286,11 @@ def _balance_flux(flux: Array, near: Region, far: Region, down: Array, up: Array
     """
     up = up * far.weight
     typical = safe_div(jnp.outer(up, down), jnp.sum(up))
-    sign = flux[0] / safe_sqrt(flux[0] ** 2 + at_least(LITTLE * typical, TINY) ** 2)  # without a step
+    sign = flux[0] / safe_sqrt(flux[0] ** 2 + clamp_min(LITTLE * typical, TINY) ** 2)  # without a step
     size = flux[0] * sign
     crossing = size * near.weight
     ridge = max(RIDGE, np.sqrt(jnp.finfo(size.dtype).eps))
-    rows = at_least(jnp.sum(crossing, axis=1) + ridge * up, TINY)
+    rows = clamp_min(jnp.sum(crossing, axis=1) + ridge * up, TINY)
     columns = jnp.sum(crossing, axis=0) + ridge * down * near.weight
     missing = up - flux[0] @ near.weight
     # rows are eliminated: columns alone are left
@@ -311,13 +311,13 @@ def _reconcile_energies(
     rest = up @ far.weight - down @ near.weight
     most = [_largest_correction(level) for level in reflected]
     whole = most[0] @ near.weight + most[1] @ far.weight
-    step = safe_div(rest, at_least(whole, jnp.abs(rest)))
+    step = safe_div(rest, clamp_min(whole, jnp.abs(rest)))
     return down + step * most[0], up - step * most[1]
 
 
 def _largest_correction(level: Array) -> Array:
     """By how much what is reflected may be changed: a weak reflection by a small share alone."""
-    return level * at_most(STRONG * level, 1.0)
+    return level * clamp_max(STRONG * level, 1.0)
 
 
 def _reflection(
@@ -336,16 +336,16 @@ def _reflection(
     it is, and may change by a larger share the stronger it is.
     """
     most = _largest_correction(level)
-    resolved = (1.0 - unsampled_share) * at_most(at_least(rest, -most), most)
+    resolved = (1.0 - unsampled_share) * clamp_max(clamp_min(rest, -most), most)
     lobe = _face(region, level + resolved, ior, normals, modes, trapped_blur)
-    return lobe + unsampled_share * jnp.diag(at_least(rest, -level))
+    return lobe + unsampled_share * jnp.diag(clamp_min(rest, -level))
 
 
 def _multiple_reflected_energy(region: Region, ratio: Array, alpha: Array, once: Array, lost: Array) -> Array:
     """Share of the energy lost to masking that is reflected, by the walk on the microsurface (Heitz et al. 2016)."""
     exists = region.exists
     level, _ = interface_energies(jnp.where(exists, region.cosine, 0.5), alpha, ratio, multiple=True)
-    gain = at_least(level - once, 0.0)
+    gain = clamp_min(level - once, 0.0)
     return jnp.where(exists, jnp.where(gain < lost, gain, lost), 0.0)
 
 
@@ -373,6 +373,6 @@ def _diffuse_compensation(lost: Array, crossing: Array, weight: Array, leaving: 
     the product has no derivative there, and energy needs one."""
     staying = lost - crossing
     mean, whole = jnp.sum(weight * staying), jnp.sum(weight * lost)
-    some = mean > ROUNDED * np.sqrt(jnp.finfo(mean.dtype).eps) * whole
+    some = mean > ROUNDING_SHARE * np.sqrt(jnp.finfo(mean.dtype).eps) * whole
     profile = jnp.where(some, staying / jnp.where(some, mean, 1.0), safe_div(lost, whole))
     return jnp.outer(leaving * profile, staying)

@@ -16,7 +16,7 @@ from jax import Array
 
 from layerjax.channels import Channels
 
-TOGETHER = 2
+AXES_PER_STEP = 2
 """Axes whose entries a step of the loop reads. All three in one step are a little faster by themselves, but XLA then
 does them again for each that uses the value, and a gradient takes five times as long.
 """
@@ -48,7 +48,7 @@ def cubic(place: Array) -> tuple[Array, Array, Array, Array]:
 def look_up(tables: Sequence[Array], start: Array, axes: Sequence[Axis]) -> Channels:
     """Values of tables that share their shape; start: added to the place in the flat table."""
     flat = [table.reshape(-1) for table in tables]
-    outer, inner = axes[:-TOGETHER], axes[-TOGETHER:]
+    outer, inner = axes[:-AXES_PER_STEP], axes[-AXES_PER_STEP:]
     shape = jnp.broadcast_shapes(start.shape, *(axis.place.shape for axis in axes))
     zero = jnp.zeros(shape, axes[0].place.dtype)
 

@@ -15,13 +15,13 @@ import numpy as np
 from jax import Array
 
 from layerjax import fresnel
-from layerjax._numerics import decay_between, exprel, safe_div, safe_sqrt
+from layerjax._numerics import exprel, mean_decay, safe_div, safe_sqrt
 from layerjax.channels import per_channel
 from layerjax.directions import Vector, half_vector
 from layerjax.phase import PhaseFunction
 from layerjax.stack import Medium, is_known
 from layerjax.transport.adding_doubling.grid import Region
-from layerjax.transport.adding_doubling.moments import Terms, kernel_of_moments, truncate
+from layerjax.transport.adding_doubling.moments import MomentCounts, kernel_of_moments, truncate
 from layerjax.transport.adding_doubling.operators import Layer, Operator, Parts, double, matmul, rotate
 from layerjax.transport.adding_doubling.sampling import balance, ballistic_share, modes_at_nodes
 from layerjax.transport.adding_doubling.slab import slab
@@ -74,7 +74,7 @@ class Kernel(eqx.Module):
         return jnp.roll(split, self.azimuths // 2, axis=-1).reshape(values.shape)
 
 
-def kernel_modes(phase: PhaseFunction, with_schlick: bool, region: Region, modes: int, carried: Terms) -> Kernel:
+def kernel_modes(phase: PhaseFunction, with_schlick: bool, region: Region, modes: int, carried: MomentCounts) -> Kernel:
     """Kernel of a medium that is symmetric about the normal, as Fourier modes cos(m phi) in the azimuth of travel.
 
     carried: moments, if the phase function has any.
@@ -91,7 +91,7 @@ def kernel_modes(phase: PhaseFunction, with_schlick: bool, region: Region, modes
 
 
 def _kernel_by_moments(
-    phase: PhaseFunction, with_schlick: bool, region: Region, modes: int, carried: Terms, area: Array
+    phase: PhaseFunction, with_schlick: bool, region: Region, modes: int, carried: MomentCounts, area: Array
 ) -> Kernel:
     """What quadrature misses, where there is more than one panel, counts as ballistic as well."""
     weight = 2.0 * jnp.pi * region.solid
@@ -242,7 +242,7 @@ def _single_scattering(kernel: Kernel, strength: Pair, thickness: Array) -> Pair
     gain, depth = _depths(kernel, thickness)
     into, down, up = depth[..., None, :], depth[..., :, None], kernel.turn_row(depth)[..., :, None]
     reflect = gain * exprel(up + into)
-    transmit = gain * decay_between(down, into)
+    transmit = gain * mean_decay(down, into)
     return strength[0] * reflect, strength[1] * transmit
 
 

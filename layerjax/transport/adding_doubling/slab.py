@@ -20,7 +20,7 @@ from jax import Array
 from jax.custom_batching import sequential_vmap
 
 from layerjax._batching import chunk_factor
-from layerjax._numerics import allow_broadcasting, at_least, horner
+from layerjax._numerics import allow_broadcasting, clamp_min, horner
 from layerjax.transport.adding_doubling.inverse import inverse
 
 SMALL, TINY = 0.2, 1e-4
@@ -81,7 +81,7 @@ def _slab_jvp(
 
 def _spectrum(p: Array, q: Array, half: Array) -> _Spectrum:
     lower, square, basis = _decompose(p, q)
-    root = jnp.sqrt(at_least(square, 0.0))
+    root = jnp.sqrt(clamp_min(square, 0.0))
     x = root * half[..., None]
     vectors = _transpose(inverse(lower)) @ basis
     one = jnp.eye(p.shape[-1], dtype=p.dtype)

@@ -21,7 +21,7 @@ from layerjax.surfaces import Conductor, Lambertian, Surface
 from layerjax.transport.adding_doubling.ballistic import subtract_ballistic
 from layerjax.transport.adding_doubling.bases import base_layer
 from layerjax.transport.adding_doubling.elements import Make, Scalars, build_element, element
-from layerjax.transport.adding_doubling.energies import Face, outer_faces
+from layerjax.transport.adding_doubling.energies import OuterFace, outer_faces
 from layerjax.transport.adding_doubling.facet_scattering import Normals
 from layerjax.transport.adding_doubling.grid import Grid, Region, make_grid
 from layerjax.transport.adding_doubling.interfaces import NextEvent, interface_layer
@@ -30,7 +30,7 @@ from layerjax.transport.adding_doubling.moments import terms
 from layerjax.transport.adding_doubling.operators import Layer, add
 from layerjax.transport.adding_doubling.requested_directions import requested_region
 from layerjax.transport.adding_doubling.resolution import Resolution, is_tilted
-from layerjax.transport.known_directions import Known, KnownDirections
+from layerjax.transport.known_directions import DirectionLookup, KnownDirections
 
 MANY = 3
 """Interfaces of a kind from which on they share a program."""
@@ -61,7 +61,7 @@ def make_plan(stack: Stack, resolution: Resolution, multiple: bool) -> Plan:
 
 def solve(
     stack: Stack, plan: Plan, requested: KnownDirections | None = None
-) -> tuple[Grid, Layer, Layer, tuple[Face | None, Face | None]]:
+) -> tuple[Grid, Layer, Layer, tuple[OuterFace | None, OuterFace | None]]:
     """The grid, the whole stack as one layer, that less what is known in closed form, see `ballistic`, and its outer
     faces, see `outer_faces`.
 
@@ -93,7 +93,7 @@ def make_elements(stack: Stack, plan: Plan, requested: KnownDirections | None, m
 
 def assemble(
     stack: Stack, plan: Plan, elements: list[Any]
-) -> tuple[Grid, Layer, Layer, tuple[Face | None, Face | None]]:
+) -> tuple[Grid, Layer, Layer, tuple[OuterFace | None, OuterFace | None]]:
     """See `solve`; elements: see `make_elements`. Of a base it only matters whether there is one."""
     dtype = _dtype(stack)
     grid = make_grid(_indices(stack, dtype), plan.ranks, plan.nodes, dtype)
@@ -253,7 +253,7 @@ def _base(plan: Plan, region: int, dtype: Any, numbers: Any, _: None) -> Layer:
     return base_layer(here, _relative_conductor(base, here.ior), plan.modes, plan.multiple)
 
 
-def requested_stack(stack: Stack, known: Known) -> tuple[Stack, KnownDirections] | None:
+def requested_stack(stack: Stack, known: DirectionLookup) -> tuple[Stack, KnownDirections] | None:
     """The stack with directions that can stand in the place of the grid's outer ones, if there are such.
 
     What ends with a medium is closed where nothing is requested below: light that leaves it there does not come back.

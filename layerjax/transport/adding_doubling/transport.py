@@ -24,7 +24,7 @@ from jax import Array
 from layerjax._batching import map_direction_chunks
 from layerjax._checks import require_choice
 from layerjax._devices import exact_products
-from layerjax._numerics import not_negative, safe_div
+from layerjax._numerics import clamp_nonnegative, safe_div
 from layerjax._shapes import channel_count, map_shape
 from layerjax.channels import Channels, multiply, pick, total
 from layerjax.compiling import filter_jit, is_outermost, is_traced
@@ -75,12 +75,12 @@ from layerjax.transport.first_order import (
     interaction_probability,
     peak_probability,
 )
-from layerjax.transport.known_directions import Known, KnownDirections, known_directions
+from layerjax.transport.known_directions import DirectionLookup, KnownDirections, known_directions
 from layerjax.transport.single_scattering import SingleScattering
 
 Orders = Literal["all", "first", "multiple"]
 
-MOST = 1024
+LARGEST_RESOLUTION = 1024
 """Largest number of nodes, modes, cosines or azimuths; tables of more fit in no memory."""
 
 FACETS_ERROR = 6e-5
@@ -95,10 +95,10 @@ class ResolutionWarning(UserWarning):
     under ``jit`` the widths of its lobes are not known."""
 
 
-class Solved(eqx.Module):
+class AddingDoublingState(eqx.Module):
     """A solved stack: what is evaluated in closed form, and the rest: tables, or values between known directions.
 
-    Both are None if there is no rest. ballistic: what passes two interfaces, in neither. scaled: what the rest
+    Both are None if there is no rest. ballistic: what passes two interfaces, in neither. scaled_first: what the rest
     lacks in the place of `first`, in media as the grid has them (see `moments`); None: `first` itself.
     """
 
@@ -106,7 +106,7 @@ class Solved(eqx.Module):
     tables: Tables | None
     requested: RequestedValues | None = None
     ballistic: Ballistic | None = None
-    scaled: FirstOrder | None = None
+    scaled_first: FirstOrder | None = None
 
 
 class AddingDoubling(DeterministicTransport):
@@ -167,15 +167,17 @@ class AddingDoubling(DeterministicTransport):
 
     def __check_init__(self) -> None:
         for name, value, least in (("nodes", self.nodes, 2), ("modes", self.modes, 1)):
-            if value is not None and not (isinstance(value, int) and least <= value <= MOST):
-                raise ValueError(f"AddingDoubling.{name}: {value!r:.60} is not a whole number from {least} to {MOST}")
+            if value is not None and not (isinstance(value, int) and least <= value <= LARGEST_RESOLUTION):
+                raise ValueError(
+                    f"AddingDoubling.{name}: {value!r:.60} is not a whole number from {least} to {LARGEST_RESOLUTION}"
+                )
         given = (2, 4) if self.ordinates is None else self.ordinates
         pair = isinstance(given, tuple | list) and len(given) == 2 and all(isinstance(one, int) for one in given)
         cosines, azimuths = given if pair else (0, 0)
-        if not (2 <= cosines <= MOST and 4 <= azimuths <= MOST and azimuths % 2 == 0):
+        if not (2 <= cosines <= LARGEST_RESOLUTION and 4 <= azimuths <= LARGEST_RESOLUTION and azimuths % 2 == 0):
             raise ValueError(
-                f"AddingDoubling.ordinates: {self.ordinates!r:.60} is not (cosines from 2 to {MOST}, an even number of "
-                f"azimuths from 4 to {MOST})"
+                f"AddingDoubling.ordinates: {self.ordinates!r:.60} is not (cosines from 2 to {LARGEST_RESOLUTION}, an "
+                f"even number of azimuths from 4 to {LARGEST_RESOLUTION})"
             )
         if self.tolerance is not None and not (
             isinstance(self.tolerance, float | np.floating) and 0.0 < self.tolerance < 1.0
@@ -188,7 +190,7 @@ class AddingDoubling(DeterministicTransport):
         if self.facet_multiple_scattering:
             refuse_vmf(stack, names, "AddingDoubling(facet_multiple_scattering=True)")
 
-    def resolve_options(self, stack: Stack, known: Known) -> "AddingDoubling":
+    def resolve_options(self, stack: Stack, known: DirectionLookup) -> "AddingDoubling":
         found = requested_stack(stack, known) if self.orders != "first" else None
         stack, directions = (stack, None) if found is None else found
         if self.tolerance is not None:
@@ -219,28 +221,30 @@ class AddingDoubling(DeterministicTransport):
             return self.resolve_options(stack, lambda: None)
         return self._with_resolution(self._resolution(stack, False))
 
-    def prepare(self, stack: Stack) -> Solved:
+    def prepare(self, stack: Stack) -> AddingDoublingState:
         first = first_order(stack)
         if not self._is_solved(stack):
-            return Solved(first, None)
+            return AddingDoublingState(first, None)
         plan = self._plan(stack, None)
         carried, once = _scale_stack(stack, plan)
-        return Solved(first, self._solve(stack, first, once, plan), None, ballistic_paths(carried), once)
+        return AddingDoublingState(first, self._solve(stack, first, once, plan), None, ballistic_paths(carried), once)
 
-    def traceable_equivalent(self, stack: Stack, known: Known) -> "AddingDoubling":
+    def traceable_equivalent(self, stack: Stack, known: DirectionLookup) -> "AddingDoubling":
         found = requested_stack(stack, known) if self.orders != "first" else None
         whole, directions = (stack, None) if found is None else found
         elements: list[Any] = []
         if self._is_solved(stack) and can_be_split(stack):
             make_elements(whole, self._plan(whole, directions), directions, record(linearize_element, elements))
         options = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
-        return _Planned(**options, ranks=ranks(stack), elements=elements if elements and None not in elements else None)
+        return _TraceableAddingDoubling(
+            **options, ranks=ranks(stack), elements=elements if elements and None not in elements else None
+        )
 
-    def prepare_for_albedo(self, stack: Stack) -> Solved:
+    def prepare_for_albedo(self, stack: Stack) -> AddingDoublingState:
         """Energies are means over azimuth: of Fourier modes the first is all they need."""
         return dataclasses.replace(self, modes=1).prepare(stack)
 
-    def prepare_for_directions(self, stack: Stack, known: Known) -> Solved:
+    def prepare_for_directions(self, stack: Stack, known: DirectionLookup) -> AddingDoublingState:
         found = requested_stack(stack, known) if self.orders != "first" else None
         if found is None:
             return self.prepare(stack)
@@ -248,10 +252,10 @@ class AddingDoubling(DeterministicTransport):
         plan = self._plan(closed, directions)
         rest = self._solve_requested(closed, directions, plan)
         carried, once = _scale_stack(closed, plan)
-        return Solved(first_order(closed), None, rest, ballistic_paths(carried), once)
+        return AddingDoublingState(first_order(closed), None, rest, ballistic_paths(carried), once)
 
     def evaluate_batch(
-        self, state: Solved, wi: Array, wo: Array, side: Side, channels: int, key: Array | None
+        self, state: AddingDoublingState, wi: Array, wo: Array, side: Side, channels: int, key: Array | None
     ) -> tuple[Array, None]:
         if state.requested is None:
             return super().evaluate_batch(state, wi, wo, side, channels, key)
@@ -259,13 +263,15 @@ class AddingDoubling(DeterministicTransport):
         values = self.evaluate(state, i, o, side)
         return jnp.stack([pick(values, c) for c in range(channels)], axis=-1), None
 
-    def common_error(self, state: Solved, wi: Array, wo: Array, side: Side, channels: int) -> Array | float:
+    def common_error(
+        self, state: AddingDoublingState, wi: Array, wo: Array, side: Side, channels: int
+    ) -> Array | float:
         least = FACETS_ERROR if state.first.layered else 0.0
 
         def doubts(wi: Vector, wo: Vector) -> Channels:
             rest = self._rest(state, wi, wo, side)
-            lowest = rest if state.scaled is None else self._sum(state, rest, wi, wo, side)
-            return tuple(least * jnp.abs(pick(rest, c)) + not_negative(-pick(lowest, c)) for c in range(channels))
+            lowest = rest if state.scaled_first is None else self._sum(state, rest, wi, wo, side)
+            return tuple(least * jnp.abs(pick(rest, c)) + clamp_nonnegative(-pick(lowest, c)) for c in range(channels))
 
         return map_direction_chunks(doubts, wi, wo)
 
@@ -282,13 +288,13 @@ class AddingDoubling(DeterministicTransport):
             one for one in (self.coarser(), self.finer()) if one != self._with_resolution(self._as_resolution())
         )
 
-    def evaluate(self, state: Solved, wi: Vector, wo: Vector, side: Side) -> Channels:
+    def evaluate(self, state: AddingDoublingState, wi: Vector, wo: Vector, side: Side) -> Channels:
         rest = self._rest(state, wi, wo, side)
-        if state.scaled is None:
-            return self._sum(state, tuple(map(not_negative, rest)), wi, wo, side)
-        return tuple(map(not_negative, self._sum(state, rest, wi, wo, side)))
+        if state.scaled_first is None:
+            return self._sum(state, tuple(map(clamp_nonnegative, rest)), wi, wo, side)
+        return tuple(map(clamp_nonnegative, self._sum(state, rest, wi, wo, side)))
 
-    def _rest(self, state: Solved, wi: Vector, wo: Vector, side: Side) -> Channels:
+    def _rest(self, state: AddingDoublingState, wi: Vector, wo: Vector, side: Side) -> Channels:
         """What is read off: ringing may take it below 0, and where media are scaled what it lacks may, too."""
         if state.requested is not None:
             return read_requested(state.requested, wi, wo, side)
@@ -296,23 +302,23 @@ class AddingDoubling(DeterministicTransport):
             return read_rest(state.tables, wi, wo, side)
         return (jnp.zeros_like(wi[2] * wo[2]),)
 
-    def _sum(self, state: Solved, rest: Channels, wi: Vector, wo: Vector, side: Side) -> Channels:
+    def _sum(self, state: AddingDoublingState, rest: Channels, wi: Vector, wo: Vector, side: Side) -> Channels:
         """The requested orders, of the rest and what is known in closed form."""
         parts = [rest, *_ballistic(state, wi, wo, side)]
         if self.orders == "multiple":
-            if state.scaled is None:
+            if state.scaled_first is None:
                 return total(parts)
             parts.append(tuple(-value for value in evaluate_first(state.first, wi, wo, side)))
-        parts.append(evaluate_first(state.first if state.scaled is None else state.scaled, wi, wo, side))
+        parts.append(evaluate_first(state.first if state.scaled_first is None else state.scaled_first, wi, wo, side))
         return total(parts)
 
-    def sample(self, state: Solved, wi: Vector, uniforms: tuple[Array, Array, Array]) -> Vector:
+    def sample(self, state: AddingDoublingState, wi: Vector, uniforms: tuple[Array, Array, Array]) -> Vector:
         return propose(state.first, wi, uniforms)
 
-    def pdf(self, state: Solved, wi: Vector, wo: Vector) -> Array:
+    def pdf(self, state: AddingDoublingState, wi: Vector, wo: Vector) -> Array:
         return proposal_density(state.first, wi, wo)
 
-    def albedo(self, state: Solved, wi: Vector, nodes: int) -> tuple[Channels, Channels]:
+    def albedo(self, state: AddingDoublingState, wi: Vector, nodes: int) -> tuple[Channels, Channels]:
         """What the first face does by quadrature with `nodes` points, and of the rest what the nodes scatter: lossless
         stacks lose nothing. Of media alone all is from the nodes, as a share of what meets an event at all.
 
@@ -322,7 +328,7 @@ class AddingDoubling(DeterministicTransport):
             energies = read_energies(state.tables, wi)
             if state.first.layered:
                 return directional_albedo(
-                    state.scaled or state.first, energies, wi, nodes, self.facet_multiple_scattering
+                    state.scaled_first or state.first, energies, wi, nodes, self.facet_multiple_scattering
                 )
             met = interaction_probability(state.first, wi)
             near, far = clip_negative(*energies)
@@ -403,7 +409,7 @@ class AddingDoubling(DeterministicTransport):
             state = options.prepare_for_directions(
                 stack, partial(known_directions, wi, wo) if known is not None else lambda: None
             )
-            values, found, rest = _at_probes(options, state, wi, wo, channel_count(stack))
+            values, found, rest = _probe_values(options, state, wi, wo, channel_count(stack))
             if before is not None:
                 change = float(jnp.max(safe_div(jnp.abs(found - before), values + 0.1 * jnp.mean(rest))))
                 if change <= self.tolerance:
@@ -415,7 +421,7 @@ class AddingDoubling(DeterministicTransport):
         )
 
 
-class _Planned(AddingDoubling):
+class _TraceableAddingDoubling(AddingDoubling):
     """Where the order of indices is known, though they are traced (None: it is not), and all elements, with their
     derivatives (None: they are not)."""
 
@@ -438,20 +444,20 @@ class _Planned(AddingDoubling):
 
 @filter_jit
 @exact_products
-def _at_probes(
-    options: AddingDoubling, state: Solved, wi: Array, wo: Array, channels: int
+def _probe_values(
+    options: AddingDoubling, state: AddingDoublingState, wi: Array, wo: Array, channels: int
 ) -> tuple[Array, Array, Array]:
     """Values; what of them is solved; and that without what media that were scaled lack.
 
     What is known in closed form does not change, and where it is a narrow peak it must not set the scale.
     """
     solved, without = dataclasses.replace(options, orders="multiple"), dataclasses.replace(state, ballistic=None)
-    of = (options, state), (solved, without), (solved, dataclasses.replace(without, scaled=None))
+    of = (options, state), (solved, without), (solved, dataclasses.replace(without, scaled_first=None))
     values, found, rest = (how.evaluate_batch(what, wi, wo, "all", channels, None)[0] for how, what in of)
     return values, found, rest
 
 
-def _ballistic(state: Solved, wi: Vector, wo: Vector, side: Side) -> list[Channels]:
+def _ballistic(state: AddingDoublingState, wi: Vector, wo: Vector, side: Side) -> list[Channels]:
     if state.ballistic is None or side == "reflection":
         return []
     return [evaluate_ballistic(state.ballistic, wi, wo)]

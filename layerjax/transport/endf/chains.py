@@ -23,7 +23,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from layerjax import fresnel
-from layerjax._numerics import at_least, at_most, safe_sqrt
+from layerjax._numerics import clamp_max, clamp_min, safe_sqrt
 from layerjax.channels import Channels, map_channels, multiply, total
 from layerjax.directions import Vector, half_vector
 from layerjax.normals import vmf
@@ -89,7 +89,7 @@ def reflections(coat: Coat, options: Options, wi: Vector, wo: Vector) -> list[Ch
         level = fresnel.dielectric(cosine, coat.top.ior)
         lobes: list[Channels] = [(level * _facets(h, wi, wo, coat.top.kappa, options.masking),)]
         if coat.base is not None and options.bounces:
-            chains = _by_mean_directions if options.form == "paper" else _by_inner_half_vector
+            chains = _mean_direction_lobes if options.form == "paper" else _inner_half_vector_lobes
             lobes += chains(coat, coat.top, coat.base, options, wi, wo)
         return lobes
     if coat.base is not None:
@@ -109,7 +109,7 @@ def _facets(h: Vector, wi: Vector, wo: Vector, kappa: Array, masking: vmf.Maskin
     )
 
 
-def _by_mean_directions(
+def _mean_direction_lobes(
     coat: Coat, top: UpperSide, base: LowerSide, options: Options, wi: Vector, wo: Vector
 ) -> list[Channels]:
     """Chains with all terms at the mean directions that follow from wi (Guo 2015, Secs. 5.1 and 5.3, corrected)."""
@@ -129,7 +129,7 @@ def _by_mean_directions(
     return lobes
 
 
-def _by_inner_half_vector(
+def _inner_half_vector_lobes(
     coat: Coat, top: UpperSide, base: LowerSide, options: Options, wi: Vector, wo: Vector
 ) -> list[Channels]:
     """Chains about the half vector of both directions below the surface."""
@@ -173,12 +173,12 @@ def chain_concentration(k: int, cosine: Array, top: UpperSide, base: LowerSide) 
 def inner_concentration(k: int, cosine: Array, top: UpperSide, base: LowerSide) -> Array:
     """kappa of the extended normals after k reflections at the base about the half vector below the surface, by its
     cosine with the light: variances add there."""
-    spread = crossing(cosine, top.ior)
+    spread = half_vector_ratio(cosine, top.ior)
     inverse = k / base.kappa + 0.5 * spread * spread / top.kappa
-    return 1.0 / at_least(inverse + (k - 1) / top.kappa if k > 1 else inverse, LEAST_VARIANCE)
+    return 1.0 / clamp_min(inverse + (k - 1) / top.kappa if k > 1 else inverse, LEAST_VARIANCE)
 
 
-def crossing(cosine: Array, ior: Array) -> Array:
+def half_vector_ratio(cosine: Array, ior: Array) -> Array:
     """1 - cos_out / (eta cos): turn of a half vector inside over that of the facet crossed; 1 where nothing leaves."""
     squared = (1.0 - ior) * (1.0 + ior) + ior * ior * cosine * cosine
     leaves = squared > 0
@@ -210,15 +210,15 @@ def transmittance(coat: Coat, down: Vector, up: Vector, share: float = 1.0) -> C
 
 def masking_over_cosine(w: Vector, kappa: Array, masking: vmf.Masking | None) -> Array:
     """G1 / cos, for a direction above."""
-    cosine = at_most(w[2], 1.0)
+    cosine = clamp_max(w[2], 1.0)
     return 1.0 / cosine if masking is None else vmf.masking_over_cosine(cosine, kappa, masking)
 
 
 def smith_masking(w: Vector, kappa: Array, masking: vmf.Masking | None) -> Array:
     """G1, for a direction above."""
-    return at_most(w[2], 1.0) * masking_over_cosine(w, kappa, masking)
+    return clamp_max(w[2], 1.0) * masking_over_cosine(w, kappa, masking)
 
 
 def width(kappa: Array) -> Array:
     """The width alpha of normals of concentration kappa, at most 45."""
-    return jnp.sqrt(2.0 / at_least(kappa, 1e-3))
+    return jnp.sqrt(2.0 / clamp_min(kappa, 1e-3))

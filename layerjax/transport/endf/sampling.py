@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from layerjax import channels, fresnel
-from layerjax._numerics import at_most, safe_sqrt
+from layerjax._numerics import clamp_max, safe_sqrt
 from layerjax.channels import Channels, mean, total
 from layerjax.directions import Vector, flip, half_vector, is_above, reflect, refract, sanitise, select
 from layerjax.normals import facets
@@ -100,7 +100,7 @@ def draw(coat: Coat, options: Options, wi: Vector, uniforms: tuple[Array, Array,
     by_cosine: Vector = (x, y, z if opaque else jnp.where(u < 1.0 - 0.5 * COSINE, z, -z))
     if _is_interface(coat):
         assert coat.top is not None
-        again = at_most(u / (1.0 - COSINE), BELOW_ONE)
+        again = clamp_max(u / (1.0 - COSINE), BELOW_ONE)
         wo, leaves = interface_sample(wi, coat.top.ior, width(coat.top.kappa), u1, u2, again, "vmf")
     else:
         lobes = _proposals(coat, options, wi, opaque)

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from layerjax import fresnel
-from layerjax._numerics import at_least
+from layerjax._numerics import clamp_min
 from layerjax.channels import Channels, multiply
 from layerjax.directions import Vector, flip, half_vector
 from layerjax.normals import vmf
@@ -20,7 +20,7 @@ from layerjax.transport.endf.chains import (
     LowerSide,
     Options,
     UpperSide,
-    crossing,
+    half_vector_ratio,
     masking_over_cosine,
     refract_in,
     refract_pair,
@@ -47,11 +47,11 @@ def transmissions(coat: Coat, options: Options, wi: Vector, under: Vector) -> li
         return []
     if coat.base is None:
         return [(_refraction(coat.top, options.masking, wi, under),)]
-    through = _by_mean_directions if options.form == "paper" else _by_inner_half_vector
+    through = _mean_direction_lobes if options.form == "paper" else _inner_half_vector_lobes
     return through(coat, coat.top, coat.base, options, wi, under)
 
 
-def _by_mean_directions(
+def _mean_direction_lobes(
     coat: Coat, top: UpperSide, base: LowerSide, options: Options, wi: Vector, under: Vector
 ) -> list[Channels]:
     """All terms at the mean direction, that of light which is not deflected."""
@@ -72,7 +72,7 @@ def _by_mean_directions(
     return lobes
 
 
-def _by_inner_half_vector(
+def _inner_half_vector_lobes(
     coat: Coat, top: UpperSide, base: LowerSide, options: Options, wi: Vector, under: Vector
 ) -> list[Channels]:
     """About the half vector of both directions inside the slab."""
@@ -108,9 +108,9 @@ def slab_concentration(j: int, cosine: Array, top: UpperSide, base: LowerSide) -
 def inner_slab_concentration(j: int, cosine: Array, top: UpperSide, base: LowerSide) -> Array:
     """kappa of the extended normals after j reflections at each side about the half vector inside, by its cosine with
     the light: variances add there."""
-    spread = crossing(cosine, top.ior)
+    spread = half_vector_ratio(cosine, top.ior)
     inverse = (j + 0.25 * spread * spread) * (1.0 / top.kappa + 1.0 / base.kappa)
-    return 1.0 / at_least(inverse, LEAST_VARIANCE)
+    return 1.0 / clamp_min(inverse, LEAST_VARIANCE)
 
 
 def _refraction(top: UpperSide, masking: vmf.Masking | None, wi: Vector, under: Vector) -> Array:

@@ -135,7 +135,7 @@ class ENDF(DeterministicTransport):
     def evaluate(self, state: Sides, wi: Vector, wo: Vector, side: Side) -> Channels:
         coat = state.upper
         if side != "reflection":
-            coat, wi, wo = _facing(state, wi, wo)
+            coat, wi, wo = _orient(state, wi, wo)
         lit, up, down = is_above(wi), is_above(wo), is_above(flip(wo))
         # both kinds of lobe share what depends on how steep wo is, not on its side
         wi, over = sanitise(wi), sanitise(wo if side == "reflection" else select(down, flip(wo), wo))
@@ -149,24 +149,24 @@ class ENDF(DeterministicTransport):
         return total(parts)
 
     def sample(self, state: Sides, wi: Vector, uniforms: tuple[Array, Array, Array]) -> Vector:
-        coat, up, _ = _facing(state, wi, wi)
+        coat, up, _ = _orient(state, wi, wi)
         wo = sampling.draw(coat, self._options(), up, uniforms, state.lower is None)
         return wo if state.lower is None else select(wi[2] > 0, wo, flip(wo))
 
     def pdf(self, state: Sides, wi: Vector, wo: Vector) -> Array:
-        coat, wi, wo = _facing(state, wi, wo)
+        coat, wi, wo = _orient(state, wi, wo)
         return sampling.density(coat, self._options(), wi, wo, state.lower is None)
 
     def albedo(self, state: Sides, wi: Vector, nodes: int) -> tuple[Channels, Channels]:
         """By quadrature, every lobe with a rule of its own: 32 nodes give 1e-4, 2e-3 near the critical angle."""
-        coat, wi, _ = _facing(state, wi, wi)
+        coat, wi, _ = _orient(state, wi, wi)
         return sampling.energies(coat, self._options(), wi, nodes, state.lower is None)
 
     def _options(self) -> Options:
         return Options(self.bounces, self.form, self.masking)
 
 
-def _facing(state: Sides, wi: Vector, wo: Vector) -> tuple[Coat, Vector, Vector]:
+def _orient(state: Sides, wi: Vector, wo: Vector) -> tuple[Coat, Vector, Vector]:
     """The coat as wi meets it, and both directions turned with it so that wi comes from above."""
     if state.lower is None:
         return state.upper, wi, wo

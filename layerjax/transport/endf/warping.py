@@ -16,7 +16,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jax import Array
 
-from layerjax._numerics import at_least, safe_sqrt
+from layerjax._numerics import clamp_min, safe_sqrt
 from layerjax.directions import squared_cosine_of_refraction
 from layerjax.normals.vmf import concentration_of, convolve, resultant
 
@@ -56,7 +56,7 @@ def refraction_gains(cosine: Array, ior: Array) -> Gains:
 
 def joint_concentration(*lobes: tuple[Array, Array]) -> Array:
     """Concentration of light that several lobes, each (kappa, gain), spread one after the other (Eqs. 17, 18, 21)."""
-    variances = (at_least(gain / kappa, LEAST_VARIANCE) for kappa, gain in lobes)
+    variances = (clamp_min(gain / kappa, LEAST_VARIANCE) for kappa, gain in lobes)
     return concentration_of(*convolve(*(resultant(1.0 / variance) for variance in variances)))
 
 

@@ -56,7 +56,7 @@ def average(
     quota = quotas(paths, width)
     words = key_words(key)
     padded, valid_rows = jax.tree.map(lambda x: jnp.pad(x, (0, padding)), (directions, valid))
-    known = tuple(with_stand_in(w, valid_rows) for w in padded)
+    known = tuple(replace_invalid(w, valid_rows) for w in padded)
     grouped = jax.tree.map(lambda x: x.reshape(groups, together), (known, valid_rows))
 
     def group(question: tuple[Array, Any]) -> tuple[Array, Array]:
@@ -84,7 +84,7 @@ def quotas(paths: int, batch_size: int) -> Array:
     return jnp.asarray([paths // batch_size + (j < paths % batch_size) for j in range(batch_size)], jnp.int32)
 
 
-def with_stand_in(w: Vector, valid: Array) -> Vector:
+def replace_invalid(w: Vector, valid: Array) -> Vector:
     """w, with the normal standing in where it is not valid."""
     zero, one = jnp.zeros_like(w[2]), jnp.ones_like(w[2])
     return select(valid, w, (zero, zero, one))

@@ -78,5 +78,5 @@ def boundary(scene: Scene, path: PathState, passes: Array) -> tuple[Array, Array
     inside = (surface >= 0) & (surface < scene.surfaces)
     arrives, escapes = passes & inside, passes & ~inside
     if path.facet is not None:
-        surface = jnp.where(path.facet.on, path.facet.surface, surface)
+        surface = jnp.where(path.facet.on_surface, path.facet.surface, surface)
     return arrives, escapes, jnp.clip(surface, 0, scene.surfaces - 1)

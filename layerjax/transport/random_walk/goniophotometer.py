@@ -19,7 +19,7 @@ from layerjax._parameters import cast_arrays
 from layerjax._shapes import channel_count, require_single
 from layerjax.directions import read_directions, split
 from layerjax.stack import Stack, require_numbers, simplify
-from layerjax.transport.random_walk.batches import Record, follow, kahan_add, quotas, standard_error, with_stand_in
+from layerjax.transport.random_walk.batches import Record, follow, kahan_add, quotas, replace_invalid, standard_error
 from layerjax.transport.random_walk.random_numbers import key_words
 from layerjax.transport.random_walk.scene import Scene
 from layerjax.transport.random_walk.state import Step
@@ -122,7 +122,7 @@ def _measure(
         w = split(direction)
         edge = horizon(dtype)
         valid = w[2] > edge if stack.base is not None else jnp.abs(w[2]) > edge
-        w = with_stand_in(w, valid)
+        w = replace_invalid(w, valid)
         spread = jnp.full(batch_size, w[0]), jnp.full(batch_size, w[1]), jnp.full(batch_size, w[2])
         walk = Walk(scene, spread, None, facet_multiple_scattering, count_orders=True)
         empty = [(jnp.zeros((rows, 2 * channels), dtype),) * 2 for rows in (bins, 2 * (orders + 1))]

@@ -31,7 +31,7 @@ from layerjax.transport.random_walk.surfaces import Bounce, base_of, is_base, me
 class Position(NamedTuple):
     """Where a path is on a microsurface."""
 
-    on: Array
+    on_surface: Array
     surface: Array
     height: Array
     entry: Vector

@@ -114,7 +114,7 @@ class Step(NamedTuple):
     order: Array | None
 
 
-def to_level(scene: Scene, path: PathState, at_surface: Array, surface: Array | None) -> PathState:
+def move_to_surface(scene: Scene, path: PathState, at_surface: Array, surface: Array | None) -> PathState:
     """Paths at a surface, placed there."""
     if path.depth is None:
         return path

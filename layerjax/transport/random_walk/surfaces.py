@@ -87,7 +87,7 @@ def bounce(
         target: a direction of travel away from the surface requested of the scattered light, or None.
         refracts: walkers that are to refract wherever that is possible (their `weight` then lacks the transmittance).
     """
-    wi = _facing(orient(travel, from_above, -1.0))
+    wi = _clamp_to_upper(orient(travel, from_above, -1.0))
     towards = None if target is None else orient(target, from_above)
     u1, u2, u3 = uniforms
     at_base = is_base(scene, surface)
@@ -112,7 +112,7 @@ def bounce(
         assert base is not None
         wo = base.sample(wi, u1, u2)
         leaves = wo[2] > 0
-        inside = _facing(wo)
+        inside = _clamp_to_upper(wo)
         share = tuple(_weight(f * inside[2], base.pdf(wi, inside), base) for f in base.evaluate(wi, inside))
         value: Channels = () if towards is None else base_towards(base, wi, towards)
         results.append(Bounce(value, wo, jnp.zeros_like(leaves), share, leaves))
@@ -122,7 +122,7 @@ def bounce(
 
 def base_towards(base: Surface, wi: Vector, towards: Vector) -> Channels:
     """Light that the base sends to a direction, per solid angle; 0 below it."""
-    inside = _facing(towards)
+    inside = _clamp_to_upper(towards)
     return tuple(jnp.where(towards[2] > 0, f * inside[2], 0.0) for f in base.evaluate(wi, inside))
 
 
@@ -146,7 +146,7 @@ def density(
     scene: Scene, surface: Array | None, from_above: Array, travel: Vector, onward: Vector, *, diffuse: bool
 ) -> Array:
     """Density, 1/sr, with which `bounce` turns `travel` into `onward`; with `diffuse`, a stand-in that is never 0."""
-    wi, wo = _facing(orient(travel, from_above, -1.0)), orient(onward, from_above)
+    wi, wo = _clamp_to_upper(orient(travel, from_above, -1.0)), orient(onward, from_above)
     at_base = is_base(scene, surface)
     value: Array | None = None
     if at_base is not True:
@@ -159,7 +159,7 @@ def density(
     if at_base is not False:
         base = base_of(scene)
         assert base is not None
-        below = jnp.where(wo[2] > 0, base.pdf(wi, _facing(wo)), 0.0)
+        below = jnp.where(wo[2] > 0, base.pdf(wi, _clamp_to_upper(wo)), 0.0)
         value = below if value is None else jnp.where(at_base, below, value)
     assert value is not None
     return value + DIFFUSE_SHARE * jnp.abs(wo[2]) / jnp.pi if diffuse else value
@@ -169,7 +169,7 @@ def interface_towards(
     scene: Scene, surface: Array | None, from_above: Array, travel: Vector, target: Vector
 ) -> tuple[Array, Array]:
     """What an interface sends to a direction of travel, per solid angle, and the density with which it is drawn."""
-    wi, towards = _facing(orient(travel, from_above, -1.0)), orient(target, from_above)
+    wi, towards = _clamp_to_upper(orient(travel, from_above, -1.0)), orient(target, from_above)
     ior, alpha = scene.surface_ior(surface, from_above), roughness(scene, surface)
 
     def sent(distribution: Distribution) -> tuple[Array, Array]:
@@ -229,6 +229,6 @@ def _interface(wi: Vector, wo: Vector, ior: Array, alpha: Array, distribution: D
     return jnp.where(above, reflected, refracted)
 
 
-def _facing(w: Vector) -> Vector:
+def _clamp_to_upper(w: Vector) -> Vector:
     """w with its z kept above 0: rounding may leave it in the plane of the surface."""
     return w[0], w[1], jnp.maximum(w[2], 1e-12)

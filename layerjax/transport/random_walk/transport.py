@@ -19,7 +19,7 @@ from layerjax.normals.facets import reflection_pdf, sample
 from layerjax.stack import Interface, Stack
 from layerjax.surfaces.lambertian import sample_cosine
 from layerjax.transport.contract import RandomTransport, Side, refuse_vmf
-from layerjax.transport.random_walk.batches import average, with_stand_in
+from layerjax.transport.random_walk.batches import average, replace_invalid
 from layerjax.transport.random_walk.scene import Scene
 from layerjax.transport.random_walk.state import Step
 from layerjax.transport.random_walk.walk import Orders, Walk
@@ -71,7 +71,7 @@ class RandomWalk(RandomTransport):
             valid = valid & (wi[2] > 0) & (wo[2] > 0)
         if side == "transmission":
             valid = valid & (wi[2] * wo[2] < 0)
-        wi, wo = with_stand_in(wi, valid), with_stand_in(wo, valid)
+        wi, wo = replace_invalid(wi, valid), replace_invalid(wo, valid)
 
         def walk(wi: Vector, wo: Vector) -> Walk:
             return Walk(scene, wi, wo, self.facet_multiple_scattering, self.orders)
@@ -99,7 +99,7 @@ class RandomWalk(RandomTransport):
             return (*upwards, *downwards)
 
         value, error = average(
-            walk, tally, 2 * channels, (with_stand_in(wi, valid),), valid, self.paths, self.batch_size, key
+            walk, tally, 2 * channels, (replace_invalid(wi, valid),), valid, self.paths, self.batch_size, key
         )
         above = (wi[2] > 0)[:, None]
 

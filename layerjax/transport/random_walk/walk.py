@@ -36,7 +36,16 @@ from layerjax.transport.random_walk.next_event import (
     start_aiming,
 )
 from layerjax.transport.random_walk.scene import Scene
-from layerjax.transport.random_walk.state import Arrival, Event, PathState, Step, Target, merge, to_level, weights
+from layerjax.transport.random_walk.state import (
+    Arrival,
+    Event,
+    PathState,
+    Step,
+    Target,
+    merge,
+    move_to_surface,
+    weights,
+)
 
 Orders = Literal["all", "first", "multiple"]
 
@@ -138,7 +147,7 @@ class Walk:
         scene = self.scene
         free = jnp.ones(u[0].shape, bool)
         free = free if path.aiming is None else free & ~path.aiming
-        free = free if path.facet is None else free & ~path.facet.on
+        free = free if path.facet is None else free & ~path.facet.on_surface
         path, collides, medium = free_flight(scene, path, free, u[0])
         arrives, escapes, surface = boundary(scene, path, free & ~collides)
         if path.order is not None:
@@ -146,7 +155,9 @@ class Walk:
         if not scene.surfaces:
             return path, Arrival(collides, medium, None, None, escapes)
         at_surface = arrives | ~free
-        return to_level(scene, path, at_surface, surface), Arrival(collides, medium, at_surface, surface, escapes)
+        return move_to_surface(scene, path, at_surface, surface), Arrival(
+            collides, medium, at_surface, surface, escapes
+        )
 
     def _scatter(
         self, path: PathState, arrival: Arrival, target: Target | None, u: list[Array]
@@ -247,7 +258,7 @@ class Walk:
         """
         scene, travel, surface, at_surface = self.scene, path.direction, arrival.surface, arrival.at_surface
         assert at_surface is not None
-        begins = at_surface & ~facet.on
+        begins = at_surface & ~facet.on_surface
         entry = select(begins, travel, facet.entry)
         entered_above = jnp.where(begins, from_above, facet.entered_above)
         alpha = microsurface.width(scene, surface)

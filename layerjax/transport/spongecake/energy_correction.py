@@ -28,11 +28,11 @@ from layerjax.transport.spongecake.mapping import (
     Numbers,
     features_of_pairs,
     geometry,
-    in_order,
     medium_of,
     orders,
     pair_features,
     perceptron,
+    reorder,
     scattered_share,
 )
 
@@ -71,13 +71,13 @@ def correction_share(media: tuple[Medium, ...]) -> Array:
 def polynomial(coefficients: Array | Sequence[Array], w: Vector, opposite: bool) -> Array:
     """The polynomial of a direction, from one set of coefficients; `opposite`: the same for opposite directions."""
     x, y, z = w[0], w[1], jnp.abs(w[2])
-    turning = len(coefficients) > DEGREE + 1
-    if turning and opposite:
+    anisotropic = len(coefficients) > DEGREE + 1
+    if anisotropic and opposite:
         above = w[2] > 0
         x, y = jnp.where(above, x, -x), jnp.where(above, y, -y)
-    factors = [None, x, y, x * x - y * y, 2.0 * x * y] if turning else [None]
+    factors = [None, x, y, x * x - y * y, 2.0 * x * y] if anisotropic else [None]
     found, first = jnp.zeros_like(z), 0
-    for factor, degree in zip(factors, _degrees(turning), strict=True):
+    for factor, degree in zip(factors, _degrees(anisotropic), strict=True):
         part = horner(coefficients[first : first + degree + 1], z)
         found, first = part if factor is None else found + factor * part, first + degree + 1
     return found
@@ -89,22 +89,22 @@ def correction_network(media: int, key: Array) -> eqx.nn.MLP:
     return perceptron(inputs, DEGREE + 1 + media * _azimuthal_count(), key)
 
 
-def coefficients_of(net: eqx.nn.MLP, media: Numbers, turning: bool) -> Array:
-    """Coefficients of the root of c, (2 or 1, terms), by the network. `turning`: any of the media has an axis.
+def coefficients_of(net: eqx.nn.MLP, media: Numbers, anisotropic: bool) -> Array:
+    """Coefficients of the root of c, (2 or 1, terms), by the network. `anisotropic`: any of the media has an axis.
 
     Azimuths enter by invariants of direction and axis a alone: (w_h . a_h) a_z, and (w_h . a_h)^2 less its mean.
     """
     count = len(media.thickness)
     sides = []
     for side, order in zip((1.0, -1.0), orders(count), strict=False):
-        turned = in_order(media, order)
+        turned = reorder(media, order)
         raw = net(
             jnp.concatenate([*(geometry(medium_of(turned, k)) for k in range(count)), *features_of_pairs(turned)])
         )
         raw = LARGEST / POWER * jnp.tanh(raw / LARGEST)
         level, azimuthal = raw[: DEGREE + 1], raw[DEGREE + 1 :].reshape(count, -1)
         parts = [_powers(level).at[0].add(1.0)]
-        if turning:
+        if anisotropic:
             once, twice = azimuthal[:, :DEGREE], azimuthal[:, DEGREE:]
             x, y, z = turned.axis[:, 0], turned.axis[:, 1], side * turned.axis[:, 2]
             flakes = 1.0 - turned.kind[:, 2]
@@ -132,14 +132,14 @@ def _root(sides: Array, w: Vector, from_above: bool) -> Array:
     return polynomial([jnp.where(above, high, low) for high, low in zip(*sides, strict=True)], w, False)
 
 
-def term_count(turning: bool) -> int:
-    """How many coefficients the polynomial has for light from one side; `turning`: any of the media has an axis."""
-    return sum(degree + 1 for degree in _degrees(turning))
+def term_count(anisotropic: bool) -> int:
+    """How many coefficients the polynomial has for light from one side; `anisotropic`: any of the media has an axis."""
+    return sum(degree + 1 for degree in _degrees(anisotropic))
 
 
-def _degrees(turning: bool) -> tuple[int, ...]:
+def _degrees(anisotropic: bool) -> tuple[int, ...]:
     """Degrees of the polynomials that multiply azimuthal terms, that of the constant one first."""
-    return (DEGREE, DEGREE - 1, DEGREE - 1, DEGREE - 2, DEGREE - 2) if turning else (DEGREE,)
+    return (DEGREE, DEGREE - 1, DEGREE - 1, DEGREE - 2, DEGREE - 2) if anisotropic else (DEGREE,)
 
 
 def _azimuthal_count() -> int:

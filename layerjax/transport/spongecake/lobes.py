@@ -103,8 +103,8 @@ def second_lobe(
     weights = [weights_of(net, number, albedo, f0) for number in numbers]
     correction = None
     if correction_networks is not None:
-        turning, network = has_axes(media), _cast(correction_networks[len(media)], dtype)
-        found = [coefficients_of(network, number, turning) for number in (numbers if coloured else numbers[:1])]
+        anisotropic, network = has_axes(media), _cast(correction_networks[len(media)], dtype)
+        found = [coefficients_of(network, number, anisotropic) for number in (numbers if coloured else numbers[:1])]
         correction = EnergyCorrection(jnp.stack(found), correction_share(media).astype(dtype))
     return SecondLobe(Media(tuple(slab), None), jax.tree.map(lambda *each: jnp.stack(each), *weights), correction)
 

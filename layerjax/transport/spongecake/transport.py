@@ -15,10 +15,10 @@ from layerjax.directions import Vector
 from layerjax.stack import Interface, Stack, is_known, media_of
 from layerjax.tables import load
 from layerjax.transport.contract import TEXELS, DeterministicTransport, Side
-from layerjax.transport.known_directions import Known
+from layerjax.transport.known_directions import DirectionLookup
 from layerjax.transport.single_scattering import Media, SingleScattering, choices, density, draw
 from layerjax.transport.spongecake.energy_correction import correction_network
-from layerjax.transport.spongecake.layers import MOST, pair_of
+from layerjax.transport.spongecake.layers import MOST_MEDIA, pair_of
 from layerjax.transport.spongecake.lobes import (
     Hemisphere,
     SecondLobe,
@@ -88,10 +88,10 @@ class SpongeCake(DeterministicTransport):
                     "only); SingleScattering, AddingDoubling and RandomWalk carry it"
                 )
         media = tuple(media_of(stack))
-        if len(media) > MOST and (is_traced(media) or map_shape(stack)):
+        if len(media) > MOST_MEDIA and (is_traced(media) or map_shape(stack)):
             raise ValueError(
-                f"layers: SpongeCake puts {len(media)} media together to {MOST} by their numbers, which are traced "
-                "here, or differ from texel to texel; prepare the stack outside jit, grad and vmap, or take "
+                f"layers: SpongeCake puts {len(media)} media together to {MOST_MEDIA} by their numbers, which are "
+                "traced here, or differ from texel to texel; prepare the stack outside jit, grad and vmap, or take "
                 "SingleScattering or AddingDoubling"
             )
 
@@ -101,9 +101,9 @@ class SpongeCake(DeterministicTransport):
         second = _second(pair_of(first.media), networks(), correction_networks()) if scatters else None
         return SpongeCakeState(first, second, first.base is not None)
 
-    def traceable_equivalent(self, stack: Stack, known: Known) -> "SpongeCake | None":
+    def traceable_equivalent(self, stack: Stack, known: DirectionLookup) -> "SpongeCake | None":
         """Itself, but of more media than can be traced."""
-        return self if len(media_of(stack)) <= MOST else None
+        return self if len(media_of(stack)) <= MOST_MEDIA else None
 
     def evaluate(self, state: SpongeCakeState, wi: Vector, wo: Vector, side: Side) -> Channels:
         values = SingleScattering().evaluate(state.first, wi, wo, side)
@@ -143,14 +143,16 @@ class SpongeCake(DeterministicTransport):
 def networks() -> Mapping[int, eqx.nn.MLP]:
     """The trained networks that are shipped, by the number of media."""
     table = load("spongecake")
-    return {media: unpack(table, str(media), partial(network, media)) for media in range(1, MOST + 1)}
+    return {media: unpack(table, str(media), partial(network, media)) for media in range(1, MOST_MEDIA + 1)}
 
 
 @cache
 def correction_networks() -> Mapping[int, eqx.nn.MLP]:
     """The shipped networks of `layerjax.transport.spongecake.energy_correction`, by the number of media."""
     table = load("spongecake")
-    return {media: unpack(table, f"{media}-bend", partial(correction_network, media)) for media in range(1, MOST + 1)}
+    return {
+        media: unpack(table, f"{media}-bend", partial(correction_network, media)) for media in range(1, MOST_MEDIA + 1)
+    }
 
 
 _second = eqx.filter_jit(second_lobe)

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from layerjax import channels
-from layerjax._numerics import at_least, at_most
+from layerjax._numerics import clamp_max, clamp_min
 from layerjax.channels import Channels, map_channels
 
 Orders = tuple[Channels, ...]
@@ -86,17 +86,17 @@ def add_element(above: UpperStatistics, element: Element) -> tuple[Lobe, UpperSt
     inverse = geometric_series(between)
     m = multiply_orders(above.t0, element.r12, above.ti, inverse)
     # mean number of further turns between the two, and the variance of them
-    rr = map_channels(lambda turned: turned / at_least(1.0 - turned, LEAST_ESCAPE), sum_orders(between))
+    rr = map_channels(lambda turned: turned / clamp_min(1.0 - turned, LEAST_ESCAPE), sum_orders(between))
     turns = map_channels(lambda rr, w, s: rr * (w + s), rr, element.widening, above.s_ri)
     variance = map_channels(  # Eq. (36)
-        lambda s_ti, j, s_t0, w, turns: at_most(s_ti + j * (s_t0 + w + turns), MOST_VARIANCE),
+        lambda s_ti, j, s_t0, w, turns: clamp_max(s_ti + j * (s_t0 + w + turns), MOST_VARIANCE),
         above.s_ti, above.jacobian, above.s_t0, element.widening, turns,
     )  # fmt: skip
     s_t0 = map_channels(  # Eqs. (47-49)
         lambda j, s, turns, d: (s + turns) / j + d, element.jacobian, above.s_t0, turns, element.down
     )
     s_ti = map_channels(  # Eq. (50)
-        lambda j, up, turns, s: at_most(j * (up + turns) + s, MOST_VARIANCE),
+        lambda j, up, turns, s: clamp_max(j * (up + turns) + s, MOST_VARIANCE),
         above.jacobian, element.up, turns, above.s_ti,
     )  # fmt: skip
     back = multiply_orders(element.t21, above.ri, element.t12, inverse)
@@ -112,7 +112,7 @@ def add_element(above: UpperStatistics, element: Element) -> tuple[Lobe, UpperSt
         s_t0=s_t0,
         s_ri=s_ri,
         s_ti=s_ti,
-        jacobian=map_channels(lambda j, factor: at_most(j * factor, MOST_JACOBIAN), above.jacobian, element.jacobian),
+        jacobian=map_channels(lambda j, factor: clamp_max(j * factor, MOST_JACOBIAN), above.jacobian, element.jacobian),
     )
 
 
@@ -161,7 +161,7 @@ def _product(a: Orders, b: Orders) -> Orders:
 
 def geometric_series(x: Orders) -> Orders:
     """1 + x + x^2 + ... by scattering orders."""
-    first = map_channels(lambda x: 1.0 / at_least(1.0 - x, LEAST_ESCAPE), x[0])
+    first = map_channels(lambda x: 1.0 / clamp_min(1.0 - x, LEAST_ESCAPE), x[0])
     if len(x) == 1:
         return (first,)
     found = [first]
@@ -169,7 +169,7 @@ def geometric_series(x: Orders) -> Orders:
         again = channels.total([channels.multiply(x[j], found[k - j]) for j in range(1, k + 1)])
         found.append(channels.multiply(first, again))
     rest = map_channels(
-        lambda x, known: at_least(1.0 / at_least(1.0 - x, LEAST_ESCAPE) - known, 0.0),
+        lambda x, known: clamp_min(1.0 / clamp_min(1.0 - x, LEAST_ESCAPE) - known, 0.0),
         sum_orders(x),
         channels.total(found),
     )

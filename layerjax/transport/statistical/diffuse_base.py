@@ -23,7 +23,7 @@ import numpy as np
 from jax import Array
 
 from layerjax._devices import exact_products
-from layerjax._numerics import at_least, at_most, horizon, safe_div, safe_sqrt
+from layerjax._numerics import clamp_max, clamp_min, horizon, safe_div, safe_sqrt
 from layerjax.channels import Channels, multiply, per_channel, pick, select
 from layerjax.directions import Vector, sanitise
 from layerjax.quadrature import gauss_legendre
@@ -114,7 +114,7 @@ def _closed_form(bare: Stack, base: Surface, plan: Plan, dtype: Any) -> DiffuseB
     inward, outward = (2.0 * region.weight / region.ior**2 for region in (bottom, top))
     returned = jnp.sum(inward * counted * back, axis=-1)
     if not isinstance(base, Lambertian):
-        returned = at_most(returned, LARGEST_RETURN / at_least(albedo, 1.0))
+        returned = clamp_max(returned, LARGEST_RETURN / clamp_min(albedo, 1.0))
     leaving = jnp.sum(outward * incoming, axis=-1) / bottom.ior**2  # by reciprocity
     one = jnp.ones_like(returned)
     level = closed_form(one, one, returned, albedo, bottom.ior)
@@ -165,7 +165,7 @@ def _broadcast_pair(a: Array, b: Array) -> tuple[Array, Array]:
 
 def _transmittance(part: DiffuseBase, w: Vector) -> Channels:
     rows = interpolate_rows(part.grid, part.transmittance, part.grid.regions[0].ior, w[2], w[0] * w[0] + w[1] * w[1])
-    return tuple(at_least(rows[..., c], 0.0) for c in range(rows.shape[-1]))
+    return tuple(clamp_min(rows[..., c], 0.0) for c in range(rows.shape[-1]))
 
 
 def _share(base: Surface, cosine: Array) -> Array:
@@ -173,7 +173,7 @@ def _share(base: Surface, cosine: Array) -> Array:
     if isinstance(base, Lambertian):
         return jnp.ones_like(cosine)[None]
     diffuse: Any = base
-    base = eqx.tree_at(lambda surface: surface.albedo, diffuse, at_least(jnp.asarray(diffuse.albedo), LEAST_ALBEDO))
+    base = eqx.tree_at(lambda surface: surface.albedo, diffuse, clamp_min(jnp.asarray(diffuse.albedo), LEAST_ALBEDO))
     x, w = (jnp.asarray(array, cosine.dtype) for array in gauss_legendre(NODES))
     mean = jnp.sum(2.0 * w * x * _directional_albedo(base, x), axis=-1)
     return _directional_albedo(base, cosine) / mean[:, None]

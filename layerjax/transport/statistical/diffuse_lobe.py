@@ -12,7 +12,7 @@ import numpy as np
 from jax import Array
 
 from layerjax._devices import exact_products
-from layerjax._numerics import at_least, horizon, safe_sqrt
+from layerjax._numerics import clamp_min, horizon, safe_sqrt
 from layerjax.channels import Channels, per_channel, pick
 from layerjax.directions import Vector, sanitise
 from layerjax.stack import Interface, Medium, Stack, is_known
@@ -48,7 +48,7 @@ class DiffuseLobe(eqx.Module):
         first = jnp.clip(jnp.floor(place) - 1.0, 0.0, POINTS - 4.0).astype(jnp.int32)
         taps = [weight[..., None] * self.energy[first + j] for j, weight in enumerate(cubic(place - first))]
         rows = sum(taps[1:], taps[0])
-        return tuple(at_least(rows[..., c], 0.0) for c in range(rows.shape[-1]))  # a cubic may fall below its points
+        return tuple(clamp_min(rows[..., c], 0.0) for c in range(rows.shape[-1]))  # a cubic may fall below its points
 
 
 def why_no_lobe(stack: Stack, names: Sequence[str]) -> str | None:

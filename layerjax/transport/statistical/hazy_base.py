@@ -9,7 +9,7 @@ these it is a polynomial of the cosine times the share that meets anything, whic
 import jax.numpy as jnp
 from jax import Array
 
-from layerjax._numerics import at_least, exprel
+from layerjax._numerics import clamp_min, exprel
 from layerjax.channels import Channels, map_channels, multiply, per_channel
 from layerjax.stack import Interface, Medium, Stack
 from layerjax.surfaces import Lambertian
@@ -38,7 +38,7 @@ class HazyBase(ClosedForm):
             return there
         found = streams.polynomials(cosine)
         share = tuple(exprel(depth / cosine) / cosine for depth in self.depth)
-        met = map_channels(lambda s, row: s * at_least(streams.arrival_share(found, row), 0.0), share, self.scattered)
+        met = map_channels(lambda s, row: s * clamp_min(streams.arrival_share(found, row), 0.0), share, self.scattered)
         return map_channels(jnp.add, there, met)
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from jax import Array
 
 from layerjax import channels, fresnel
-from layerjax._numerics import at_least, at_most, unstack
+from layerjax._numerics import clamp_max, clamp_min, unstack
 from layerjax.channels import Channels, map_channels, per_channel
 from layerjax.microsurface.directional_albedo import is_smooth
 from layerjax.microsurface.energy_tables import conductor_energies, escape_cone_share, interface_energies
@@ -150,7 +150,7 @@ def statistics(stack: Stack, cosine: Array, options: Options, upward: bool = Fal
 
 
 def _mean_spread(depth: Array, spread: Array, optical: Array, mean: Array) -> Array:
-    return (depth * spread + optical * mean) / at_least(depth + optical, LEAST_DEPTH)
+    return (depth * spread + optical * mean) / clamp_min(depth + optical, LEAST_DEPTH)
 
 
 def _interfaces(met: Sequence[Part], cosines: Sequence[Array], options: Options) -> list[Element]:
@@ -241,7 +241,7 @@ def _medium(medium: Medium, cosine: Array, options: Options) -> tuple[Element, t
         added = tuple(s / (1.0 + s) * width for s in scattered)
         return Element(dark, (passed,), dark, (passed,), zero, added, added, one), None
     once = channels.multiply(ballistic, scattered)
-    more = map_channels(lambda s, t, e, o: at_least(jnp.exp(s - t) - e - o, 0.0), scattered, depth, ballistic, once)
+    more = map_channels(lambda s, t, e, o: clamp_min(jnp.exp(s - t) - e - o, 0.0), scattered, depth, ballistic, once)
     orders = (ballistic, once, more)
     return Element(dark, orders, dark, orders, zero, zero, zero, one), (scattered, width)
 
@@ -253,4 +253,4 @@ def lobe_roughness(sigma: Array) -> Array:
 
 def bound_alpha(alpha: Array) -> Array:
     """A GGX width kept within the range that lobes are evaluated in."""
-    return at_most(at_least(alpha, 1e-4), 1.0)
+    return clamp_max(clamp_min(alpha, 1e-4), 1.0)

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from layerjax import channels, fresnel
-from layerjax._numerics import at_least, safe_sqrt, unstack
+from layerjax._numerics import clamp_min, safe_sqrt, unstack
 from layerjax.channels import Channels, map_channels
 from layerjax.directions import Vector
 from layerjax.microsurface.energy_tables import escape_cone_share, mirror_energy, single_reflectance
@@ -87,7 +87,7 @@ class MicrofacetLobes(NamedTuple):
 
 def microfacet_lobes(stack: Stack, options: Options, cosine: Array, upward: bool) -> MicrofacetLobes:
     """Lobes of a simplified stack, lit from above, or from below (`upward`). Diffuse bases are omitted."""
-    cosine = at_least(cosine, GRAZING)
+    cosine = clamp_min(cosine, GRAZING)
     found = statistics(stack, cosine, options, upward)
     reflected, facet = _reflected_lobes(found, cosine)
     transmitted, escaping = _transmitted_lobes(stack, found, cosine, upward)
@@ -99,7 +99,7 @@ def microfacet_lobes(stack: Stack, options: Options, cosine: Array, upward: bool
 
 
 def _scale(lobe: _Lobe, alpha: Channels, unscaled: Channels) -> MicrofacetLobe:
-    scale = map_channels(lambda energy, whole: energy / at_least(whole, LEAST_ENERGY), lobe.energy, unscaled)
+    scale = map_channels(lambda energy, whole: energy / clamp_min(whole, LEAST_ENERGY), lobe.energy, unscaled)
     return MicrofacetLobe(lobe.energy, scale, alpha or None)
 
 
@@ -113,7 +113,7 @@ def index_below(stack: Stack) -> Array:
 
 def reference_index(stack: Stack) -> Array:
     """Index of the medium in which transmitted lobes are described: the larger of those above and below."""
-    return at_least(index_below(stack), 1.0)
+    return clamp_min(index_below(stack), 1.0)
 
 
 def fold(w: Vector, ratio: Array) -> Vector:

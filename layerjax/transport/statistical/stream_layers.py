@@ -18,7 +18,17 @@ from jax import Array
 from layerjax._numerics import allow_broadcasting
 from layerjax.channels import per_channel
 from layerjax.stack import Interface, Medium, is_known
-from layerjax.transport.statistical.streams import DIFFUSE, NODES, STREAMS, WEIGHTS, Face, dot, face, matmul, matvec
+from layerjax.transport.statistical.streams import (
+    DIFFUSE,
+    NODES,
+    STREAMS,
+    WEIGHTS,
+    InterfaceMatrices,
+    dot,
+    interface_matrices,
+    matmul,
+    matvec,
+)
 
 STEPS = 18
 """Doublings of a slab: from one thinner than 0.02 to half of the thickest medium of the box, 1e4."""
@@ -47,7 +57,7 @@ def black_base(dtype: Any) -> LowerLayers:
     return LowerLayers(whole, None, zero, jnp.ones((), dtype))
 
 
-def add_interface(below: LowerLayers, what: Face, ior: Array) -> LowerLayers:
+def add_interface(below: LowerLayers, what: InterfaceMatrices, ior: Array) -> LowerLayers:
     """An interface on top. ior: index below it over that above."""
     return _add(below, what, below.ratio / (ior * ior))
 
@@ -60,7 +70,7 @@ def add_medium(below: LowerLayers, medium: Medium) -> LowerLayers:
         reflected = None if below.reflected is None else passed[:, :, None] * below.reflected * passed[:, None, :]
         return below._replace(arrival=below.arrival * passed, reflected=reflected)
     reflected, passed = _slab_of(medium, dtype)
-    return _add(below, Face(passed, passed, reflected, reflected), below.ratio)
+    return _add(below, InterfaceMatrices(passed, passed, reflected, reflected), below.ratio)
 
 
 def add_layers(below: LowerLayers, layers: Sequence[Interface | Medium]) -> tuple[LowerLayers, Array]:
@@ -69,14 +79,16 @@ def add_layers(below: LowerLayers, layers: Sequence[Interface | Medium]) -> tupl
     interfaces = [layer for layer in layers if isinstance(layer, Interface)]
     indices = [jnp.ones((), dtype), *(jnp.asarray(layer.ior, dtype) for layer in interfaces)]
     ratios = [behind / before for before, behind in pairwise(indices)]
-    together = face(jnp.stack([jnp.asarray(layer.alpha, dtype) for layer in interfaces]), jnp.stack(ratios))
+    together = interface_matrices(
+        jnp.stack([jnp.asarray(layer.alpha, dtype) for layer in interfaces]), jnp.stack(ratios)
+    )
     k = len(interfaces)
     for layer in reversed(layers):
         if isinstance(layer, Medium):
             below = add_medium(below, layer)
         else:
             k -= 1
-            below = add_interface(below, Face(*(part[k] for part in together)), ratios[k])
+            below = add_interface(below, InterfaceMatrices(*(part[k] for part in together)), ratios[k])
     return below, indices[-1]
 
 
@@ -102,7 +114,7 @@ def _channels(value: Any, dtype: Any) -> Array:
     return jnp.stack(per_channel(jnp.asarray(value, dtype)))
 
 
-def _add(below: LowerLayers, what: Face, ratio: Array) -> LowerLayers:
+def _add(below: LowerLayers, what: InterfaceMatrices, ratio: Array) -> LowerLayers:
     met = inter_reflection(below, what.bottom)
     reflected = what.top
     if below.reflected is not None:
@@ -145,7 +157,7 @@ class UpperLayers(NamedTuple):
     inside: Array
 
 
-def first_interface(what: Face) -> UpperLayers:
+def first_interface(what: InterfaceMatrices) -> UpperLayers:
     """The interface alone."""
     return UpperLayers(what.bottom[None], jnp.asarray(np.eye(STREAMS), what.bottom.dtype)[None])
 

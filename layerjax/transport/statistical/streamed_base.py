@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from layerjax._numerics import at_least, horizon
+from layerjax._numerics import clamp_min, horizon
 from layerjax.channels import Channels, map_channels, multiply, per_channel, select, total
 from layerjax.directions import Vector, sanitise
 from layerjax.stack import Interface, Medium, Stack, is_known
@@ -96,7 +96,7 @@ class StreamedBase(ClosedForm):
         there = _ballistic_arrival(self, 1.0 - passed, *streams.two_cosines(shares))
         if self.scattered is not None:
             there = map_channels(lambda t, row: t + streams.arrival_share(shares, row), there, self.scattered[0])
-        return tuple(passed * at_least(t, 0.0) for t in there)
+        return tuple(passed * clamp_min(t, 0.0) for t in there)
 
 
 def is_streamed(stack: Stack) -> bool:
@@ -112,8 +112,8 @@ def make_streamed(stack: Stack) -> StreamedBase:
     indices = [jnp.ones((), dtype), *(jnp.asarray(layer.ior, dtype) for layer in interfaces)]
     alphas = [jnp.asarray(layer.alpha, dtype) for layer in interfaces]
     ratios = [behind / before for before, behind in pairwise(indices)]
-    together = streams.face(jnp.stack(alphas), jnp.stack(ratios))  # at one look
-    faces = [streams.Face(*(part[k] for part in together)) for k in range(len(alphas))]
+    together = streams.interface_matrices(jnp.stack(alphas), jnp.stack(ratios))  # at one look
+    faces = [streams.InterfaceMatrices(*(part[k] for part in together)) for k in range(len(alphas))]
     end = next((k for k, layer in enumerate(stack.layers) if k and isinstance(layer, Interface)), len(stack.layers))
     bottom = below = stream_layers.black_base(dtype)
     second, k = None, len(faces)

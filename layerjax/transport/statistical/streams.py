@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from layerjax._numerics import at_least, at_most
+from layerjax._numerics import clamp_max, clamp_min
 from layerjax.microsurface.energy_tables import dielectric_places, index_variable, interface_energies
 from layerjax.microsurface.splines import read
 from layerjax.quadrature import gauss_legendre
@@ -68,7 +68,7 @@ LEAST_SPREAD, SKEWED, LEAST_COSINE = 1e-4, 3e-3, 0.02
 """Of a lobe: its least variance, that at which its skewness fades, and the least of the two cosines."""
 
 
-class Face(NamedTuple):
+class InterfaceMatrices(NamedTuple):
     """An interface between diffuse light, at the nodes: down and up through it, and back from above and from below."""
 
     down: Array
@@ -116,17 +116,17 @@ def two_cosines(shares: Array) -> tuple[Array, Array, Array]:
     Of a beam, whose third moment is the rounding of a table, they are even about the mean.
     """
     _, mean, square, cube = (dot(shares, jnp.asarray(row, shares.dtype)) for row in _MOMENTS_OF)
-    spread = at_least(square - mean * mean, LEAST_SPREAD)
+    spread = clamp_min(square - mean * mean, LEAST_SPREAD)
     skew = cube - mean * (3.0 * square - 2.0 * mean * mean)
     lean = skew * spread / (spread * spread + SKEWED * SKEWED)
     apart = jnp.sqrt(lean * lean + 4.0 * spread)
     low, high = mean + 0.5 * (lean - apart), mean + 0.5 * (lean + apart)
     share = (mean - low) / apart
-    cosines = at_most(at_least(jnp.stack([low, high]), LEAST_COSINE), 1.0)
+    cosines = clamp_max(clamp_min(jnp.stack([low, high]), LEAST_COSINE), 1.0)
     return cosines, jnp.stack([1.0 - share, share]), spread
 
 
-def face(alpha: Array, ior: Array) -> Face:
+def interface_matrices(alpha: Array, ior: Array) -> InterfaceMatrices:
     """An interface. ior: index below it over that above."""
     inverted = ior < 1.0
     dense = jnp.where(inverted, 1.0 / ior, ior)
@@ -141,7 +141,9 @@ def face(alpha: Array, ior: Array) -> Face:
     def chosen(dense_below: Array, dense_above: Array) -> Array:
         return jnp.where(flipped, dense_above, dense_below)
 
-    return Face(chosen(inward, outward), chosen(outward, inward), chosen(outer, inner), chosen(inner, outer))
+    return InterfaceMatrices(
+        chosen(inward, outward), chosen(outward, inward), chosen(outer, inner), chosen(inner, outer)
+    )
 
 
 def pack(inward: np.ndarray, outer: np.ndarray, inner: np.ndarray) -> np.ndarray:

@@ -29,7 +29,7 @@ from layerjax.stack import Interface, Medium, Stack
 from layerjax.surfaces import Conductor, Surface
 from layerjax.surfaces.interface import interface_reflection
 from layerjax.transport.contract import TEXELS, DeterministicTransport, Side, refuse_vmf
-from layerjax.transport.known_directions import Known
+from layerjax.transport.known_directions import DirectionLookup
 from layerjax.transport.statistical.coated_base import is_coated, make_coated
 from layerjax.transport.statistical.diffuse_base import make_diffuse
 from layerjax.transport.statistical.diffuse_lobe import make_diffuse_lobe, why_no_lobe
@@ -156,7 +156,7 @@ class Statistical(DeterministicTransport):
                 diffuse = _closed_form(stack)
         return StatisticalState(stack, diffuse, index_below(stack), reference_index(stack), smooth_parts(stack))
 
-    def traceable_equivalent(self, stack: Stack, known: Known) -> "Statistical | None":
+    def traceable_equivalent(self, stack: Stack, known: DirectionLookup) -> "Statistical | None":
         """Itself, but where alphas are known to be as narrow as can be, which are traced as any others would be."""
         return None if any(smooth_parts(stack)) or self._needs_solver(stack) else self
 

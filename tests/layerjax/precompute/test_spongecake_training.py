@@ -22,7 +22,9 @@ def drawn(media, shards=3, seed=1):
     """Materials and directions as they are drawn, values made up."""
     random = np.random.default_rng(seed)
     parts = [data.draw_layers(random, media, data.SHARD)[0] for _ in range(shards)]
-    layers = data.Layers(*(np.concatenate(each) for each in zip(*(vars(p).values() for p in parts), strict=True)))
+    layers = data.LayerParameters(
+        *(np.concatenate(each) for each in zip(*(vars(p).values() for p in parts), strict=True))
+    )
     wi, wo = data.draw_directions(random, len(layers.alpha))
     values = 0.05 * random.uniform(size=wo.shape[:-1])
     return data.Samples(layers, *(array.astype(np.float32) for array in (wi, wo, values)))

@@ -201,7 +201,7 @@ def test_interfaces_are_as_their_quadrature() -> None:
     random = np.random.default_rng(0)
     alpha, ior = np.exp(random.uniform(np.log(1e-4), 0.0, 30)), np.exp(random.uniform(0.0, np.log(4.0), 30))
     inward, outward = diffuse_moments(alpha, ior), diffuse_moments(alpha, 1.0 / ior)
-    found = streams.face(jnp.asarray(alpha), jnp.asarray(ior))
+    found = streams.interface_matrices(jnp.asarray(alpha), jnp.asarray(ior))
     wanted = (
         (found.down, inward.through + _rest(outward.later, inward.later)),
         (found.top, inward.back + _rest(inward.returned, inward.returned)),
