@@ -18,6 +18,6 @@ def conductor_energy(cosine, alpha, ior, k, multiple, *, points=POINTS):
     if not multiple:
         upper = reflection_region(make_cap(cosine, alpha), points)
         reflectance = fresnel.conductor(upper.facing, ior[..., None, None], k[..., None, None])
-        return upper.mean(reflectance * masking(upper.reflected(), upper.alpha))
+        return upper.mean(reflectance * masking(upper.reflected_cosine(), upper.alpha))
     first, reflected_on = first_mirror(cosine, alpha, ior, k, points=points)
     return jnp.clip(first + reflected_on * conductor_multiple_reflectance(cosine, alpha, ior, k), 0.0, 1.0)

@@ -96,7 +96,7 @@ def _solved(work: Path, count: int, media: int, report: Callable[[str], None]) -
 
 def lobes_alone(stack: lj.Stack) -> lj.Prepared:
     """The stack made ready for SpongeCake without the factor that puts energies right."""
-    return eqx.tree_at(lambda ready: ready.state.second.bend, lj.prepare(stack, CAKE), None)
+    return eqx.tree_at(lambda ready: ready.state.second.energy_correction, lj.prepare(stack, CAKE), None)
 
 
 Ready = Callable[[lj.Stack], lj.Prepared]
