@@ -155,17 +155,17 @@ def _operators(
         far, inside, rest, unsampled_share, near.ior / far.ior, normals, modes, _trapped_blur(grid, next_event)
     )
     once: list[Array | None] = [outer, through, _adjoint(through, leaving, far), inner]
-    returned: list[Array | None] = [None] * 4
+    compensation: list[Array | None] = [None] * 4
     if multiple:
-        turned = [
+        reflected = [
             _multiple_reflected_energy(a, b.ior / a.ior, normals.alpha, level, lost)
             for a, b, level, lost in ((near, far, outside, lost_outside), (far, near, inside, lost_inside))
         ]
         gains = _energy_compensation(
-            (lost_outside, lost_inside), turned, (near.weight, far.weight), (leaving, far.weight)
+            (lost_outside, lost_inside), reflected, (near.weight, far.weight), (leaving, far.weight)
         )
-        returned = [jnp.zeros((modes, *gain.shape), gain.dtype).at[0].set(gain) for gain in gains]
-    found = list(map(Parts, once, returned))
+        compensation = [jnp.zeros((modes, *gain.shape), gain.dtype).at[0].set(gain) for gain in gains]
+    found = list(map(Parts, once, compensation))
     return [_select_requested(parts, place, requested) for place, parts in enumerate(found)] if requested else found
 
 
@@ -350,14 +350,14 @@ def _multiple_reflected_energy(region: Region, ratio: Array, alpha: Array, once:
 
 
 def _energy_compensation(
-    lost: tuple[Array, Array], turned: Sequence[Array], weights: tuple[Array, Array], leaving: tuple[Array, Array]
+    lost: tuple[Array, Array], reflected: Sequence[Array], weights: tuple[Array, Array], leaving: tuple[Array, Array]
 ) -> list[Array]:
     """What the four operators gain when energy lost to masking is returned (after Kulla & Conty 2017), both sides.
 
     What is reflected, r, comes back diffusely as r r' / <r>, and what crosses, t, as t t' / <t>: reciprocal,
     and all that is lost returns. As much must cross one way as the other; where the two differ, the smaller decides.
     """
-    crossing = [l - r for l, r in zip(lost, turned, strict=True)]
+    crossing = [l - r for l, r in zip(lost, reflected, strict=True)]
     sums = [jnp.sum(weight * t) for weight, t in zip(weights, crossing, strict=True)]
     least = jnp.where(sums[0] < sums[1], sums[0], sums[1])
     crossing = [t * safe_div(least, total) for t, total in zip(crossing, sums, strict=True)]
@@ -371,8 +371,8 @@ def _energy_compensation(
 def _diffuse_compensation(lost: Array, crossing: Array, weight: Array, leaving: Array) -> Array:
     """What is reflected. Where nothing is, at equal indices, it comes back like all that is lost:
     the product has no derivative there, and energy needs one."""
-    staying = lost - crossing
-    mean, whole = jnp.sum(weight * staying), jnp.sum(weight * lost)
+    reflected = lost - crossing
+    mean, whole = jnp.sum(weight * reflected), jnp.sum(weight * lost)
     some = mean > ROUNDING_SHARE * np.sqrt(jnp.finfo(mean.dtype).eps) * whole
-    profile = jnp.where(some, staying / jnp.where(some, mean, 1.0), safe_div(lost, whole))
-    return jnp.outer(leaving * profile, staying)
+    profile = jnp.where(some, reflected / jnp.where(some, mean, 1.0), safe_div(lost, whole))
+    return jnp.outer(leaving * profile, reflected)

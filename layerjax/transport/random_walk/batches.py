@@ -60,11 +60,11 @@ def average(
     grouped = jax.tree.map(lambda x: x.reshape(groups, together), (known, valid_rows))
 
     def group(question: tuple[Array, Any]) -> tuple[Array, Array]:
-        index, (vectors, valid_rows) = question
+        index, (vectors, is_valid) = question
         spread = jax.tree.map(lambda x: jnp.repeat(x, width), vectors)
         count = together * width
         walker = index.astype(jnp.uint32) * jnp.uint32(count) + jnp.arange(count, dtype=jnp.uint32)
-        remaining = jnp.where(valid_rows[:, None], quota, 0).reshape(-1)
+        remaining = jnp.where(is_valid[:, None], quota, 0).reshape(-1)
         totals = _sums(walk(*spread), tally, outputs, walker, remaining, words, dtype)
         first, second = (jnp.stack(x, axis=-1).reshape(together, width, outputs).sum(axis=1) for x in totals)
         return first, second
