@@ -12,10 +12,10 @@ from fits.reports.html import FitReport
 from fits.reports.verdicts import DEFAULT, ReportOptions
 from fits.sampling.posterior import Posterior
 from layerjax._checks import require_kind
-from layerjax.compiling import programs_kept
+from layerjax.compiling import program_cache
 
 
-@programs_kept()
+@program_cache()
 def report(
     fit: Fit | FittedMap,
     posterior: Posterior | None = None,

@@ -248,14 +248,17 @@ def configure(double: bool | None, threads: int) -> None:
 
 def environment() -> dict[str, str]:
     """Environment variables of a worker process of this machine: one thread, and the programs of its parent."""
-    from layerjax.compiling import FOLDER, LEAST
+    from layerjax.compiling import CACHE_DIRECTORY, CACHE_LEAST_TIME
 
     variables = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NPROC"), "1")
     if "XLA_PYTHON_CLIENT_PREALLOCATE" not in os.environ:  # several use one accelerator
         variables["XLA_PYTHON_CLIENT_PREALLOCATE"] = "false"
     values = sys.modules["jax"].config.values
-    if values[FOLDER]:
-        variables |= {FOLDER.upper(): values[FOLDER], LEAST.upper(): str(values[LEAST])}
+    if values[CACHE_DIRECTORY]:
+        variables |= {
+            CACHE_DIRECTORY.upper(): values[CACHE_DIRECTORY],
+            CACHE_LEAST_TIME.upper(): str(values[CACHE_LEAST_TIME]),
+        }
     return variables
 
 

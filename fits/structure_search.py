@@ -42,8 +42,8 @@ from fits.reports.tables import comparison_table
 from fits.reports.verdicts import listed, verdict
 from fits.store import Store, fingerprint, make_directory
 from layerjax._checks import require_count, require_kind, require_number, require_seed
-from layerjax._numerics import broadcasting
-from layerjax.compiling import programs_kept
+from layerjax._numerics import allow_broadcasting
+from layerjax.compiling import program_cache
 
 STORE = "search.store"
 TOGETHER = 8  # structures at a time, at most: as many programs as a process can hold beside those that it has
@@ -231,7 +231,7 @@ def named(structure: Structure) -> str:
     return " / ".join(structure)
 
 
-@programs_kept()
+@program_cache()
 def search(
     data: Measurements,
     library: Library | None = None,
@@ -354,7 +354,7 @@ class _Work(NamedTuple):
             for first in range(0, len(structures), several):
                 make_room()
                 some = structures[first : first + several]
-                for structure, result in zip(some, pool.map(broadcasting(call), some), strict=True):
+                for structure, result in zip(some, pool.map(allow_broadcasting(call), some), strict=True):
                     results[structure] = result
                     self.progress(stage, len(results), len(structures), named(structure))
         return results

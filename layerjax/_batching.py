@@ -12,27 +12,27 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from layerjax._devices import over_devices
+from layerjax._devices import shard_rows
 from layerjax.directions import split
 
 CHUNK_BYTES = 20_000
 """Size of one component of a chunk: 5,000 pairs in float32, 2,500 in float64."""
 
-ROOM = 400
+ACCELERATOR_FACTOR = 400
 """Times as large are chunks where there is no processor's cache to stay in: what memory holds, if all is kept."""
 
 BLOCK_CHUNKS = 4
 """Chunks that are transposed together."""
 
-LANES = 16
+VECTOR_WIDTH = 16
 """Rows of a chunk are a multiple of this: the widest vector of a processor, in float32."""
 
 
-def room() -> int:
+def chunk_factor() -> int:
     """Times as much as on a processor that a chunk may hold, on the device that a program is traced for."""
     chosen = jax.default_device.value
     platform = jax.default_backend() if chosen is None else getattr(chosen, "platform", chosen)
-    return 1 if platform == "cpu" else ROOM
+    return 1 if platform == "cpu" else ACCELERATOR_FACTOR
 
 
 def even_chunks(count: int, chunks: int) -> tuple[int, int]:
@@ -41,12 +41,12 @@ def even_chunks(count: int, chunks: int) -> tuple[int, int]:
     A loop over chunks whose rows no vector divides took three times as long a row.
     """
     rows = -(-count // chunks)
-    if rows >= LANES**2:  # where filling up costs little
-        rows = -(-rows // LANES) * LANES
+    if rows >= VECTOR_WIDTH**2:  # where filling up costs little
+        rows = -(-rows // VECTOR_WIDTH) * VECTOR_WIDTH
     return -(-count // max(1, rows)), rows
 
 
-def by_rows(function: Callable[[Any], Any], rows: Any, chunks: int = 2) -> Any:
+def map_row_chunks(function: Callable[[Any], Any], rows: Any, chunks: int = 2) -> Any:
     """function over arrays that share their first axis, in chunks of it, at least two.
 
     The loop keeps what goes in and what comes out in memory: XLA would fuse cheap consumers with dear producers, and
@@ -67,7 +67,7 @@ def by_rows(function: Callable[[Any], Any], rows: Any, chunks: int = 2) -> Any:
     return jax.tree.map(lambda array: array.reshape(chunks * size, *array.shape[2:])[:count], found)
 
 
-def in_chunks(function: Callable[..., tuple[Array, ...]], *inputs: Array) -> Array:
+def map_direction_chunks(function: Callable[..., tuple[Array, ...]], *inputs: Array) -> Array:
     """function over arrays of shape ``(..., 3)`` as components, its results along a new last axis.
 
     Many pairs run in blocks, which are transposed to components and back (a loop that reads every third number takes
@@ -76,18 +76,18 @@ def in_chunks(function: Callable[..., tuple[Array, ...]], *inputs: Array) -> Arr
     """
     batch = jnp.broadcast_shapes(*(array.shape for array in inputs))[:-1]
     pairs = math.prod(batch)
-    chunk = room() * CHUNK_BYTES // inputs[0].dtype.itemsize
+    chunk = chunk_factor() * CHUNK_BYTES // inputs[0].dtype.itemsize
     if pairs <= 2 * chunk:
         return jnp.stack([jnp.broadcast_to(result, batch) for result in function(*map(split, inputs))], axis=-1)
     flat = [jnp.broadcast_to(array, (*batch, 3)).reshape(pairs, 3) for array in inputs]
-    return over_devices(partial(_in_blocks, function, chunk), flat, least=chunk).reshape(*batch, -1)
+    return shard_rows(partial(_map_blocks, function, chunk), flat, least=chunk).reshape(*batch, -1)
 
 
-def _in_blocks(function: Callable[..., tuple[Array, ...]], chunk: int, flat: list[Array]) -> Array:
+def _map_blocks(function: Callable[..., tuple[Array, ...]], chunk: int, flat: list[Array]) -> Array:
     """function over arrays (n, 3), block by block."""
     pairs, size = flat[0].shape[0], BLOCK_CHUNKS * chunk
     whole = pairs // size * size
-    run = partial(_block, function, chunk)
+    run = partial(_map_block, function, chunk)
     parts = []
     if whole:
         blocks = [array[:whole].reshape(-1, size, 3) for array in flat]
@@ -99,11 +99,11 @@ def _in_blocks(function: Callable[..., tuple[Array, ...]], chunk: int, flat: lis
         number, even = even_chunks(left, -(-left // chunk))
         # a vector of zeros is no direction: it gives 0
         rest = [jnp.pad(array[whole:], ((0, number * even - left), (0, 0))) for array in flat]
-        parts.append(_block(function, even, *rest)[:left])
+        parts.append(_map_block(function, even, *rest)[:left])
     return jnp.concatenate(parts)
 
 
-def _block(function: Callable[..., tuple[Array, ...]], chunk: int, *rows: Array) -> Array:
+def _map_block(function: Callable[..., tuple[Array, ...]], chunk: int, *rows: Array) -> Array:
     """function over a whole number of chunks, (n, 3) each."""
     vectors = [tuple(array.T.reshape(3, -1, chunk)) for array in jax.lax.optimization_barrier(rows)]
     step = jax.checkpoint(lambda _, vectors: (None, function(*vectors)))

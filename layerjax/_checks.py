@@ -11,7 +11,7 @@ import numpy as np
 MOST_LETTERS = 60
 
 
-def in_short(value: object) -> str:
+def abbreviate(value: object) -> str:
     """A value of whatever kind, on one line and cut short; a class is called one."""
     if isinstance(value, type):
         return f"the class {value.__name__}"
@@ -22,7 +22,7 @@ def require_kind(name: str, value: object, *kinds: type | None, fix: str = "") -
     """Refuse what is of none of these types, and say what to do; None among them: it may be None."""
     if not isinstance(value, tuple(kind for kind in kinds if kind is not None)) and not (value is None in kinds):
         words = " or ".join("None" if kind is None else f"a {kind.__name__}" for kind in kinds)
-        raise ValueError(f"{name}: {in_short(value)} is not {words}{f'; {fix}' if fix else ''}")
+        raise ValueError(f"{name}: {abbreviate(value)} is not {words}{f'; {fix}' if fix else ''}")
 
 
 def require_count(name: str, value: object, least: int, most: int | None = None) -> None:
@@ -30,7 +30,7 @@ def require_count(name: str, value: object, least: int, most: int | None = None)
     above = most is not None and isinstance(value, int | np.integer) and value > most
     if not isinstance(value, int | np.integer) or isinstance(value, bool) or value < least or above:
         words = f"of at least {least}" if most is None else f"from {least} to {most}"
-        raise ValueError(f"{name}: {in_short(value)} is not a whole number {words}")
+        raise ValueError(f"{name}: {abbreviate(value)} is not a whole number {words}")
 
 
 def require_seed(seed: object) -> None:
@@ -45,13 +45,13 @@ def require_number(
     number: Any = value if isinstance(value, Real) and not isinstance(value, bool) else math.nan
     if not (low < number < high if open_ends else low <= number <= high):
         left, right = "()" if open_ends else "[]"
-        raise ValueError(f"{name} is {in_short(value)}; it must be a number in {left}{low:g}, {high:g}{right}")
+        raise ValueError(f"{name} is {abbreviate(value)}; it must be a number in {left}{low:g}, {high:g}{right}")
 
 
 def require_choice(name: str, value: object, allowed: Iterable[Any]) -> None:
     """Refuse what is not one of these words, or neither True nor False."""
     if not any(value is one or (isinstance(value, str) and value == one) for one in allowed):
-        raise ValueError(f"{name}: {in_short(value)} is not one of {', '.join(map(repr, allowed))}")
+        raise ValueError(f"{name}: {abbreviate(value)} is not one of {', '.join(map(repr, allowed))}")
 
 
 def require_key(key: Any) -> None:
@@ -61,4 +61,4 @@ def require_key(key: Any) -> None:
         if key.shape == () if typed else key.dtype == np.uint32 and key.ndim == 1 and key.size in (2, 4):
             return
     seed = key if isinstance(key, int) else 0
-    raise ValueError(f"key: {in_short(key)} is not a JAX random key, such as jax.random.key({seed})")
+    raise ValueError(f"key: {abbreviate(key)} is not a JAX random key, such as jax.random.key({seed})")

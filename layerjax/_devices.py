@@ -21,7 +21,7 @@ P = ParamSpec("P")
 T = TypeVar("T")
 
 ROWS = "rows"
-_in_use: ContextVar[int] = ContextVar("devices", default=1)  # by the program that this thread is tracing
+_device_count: ContextVar[int] = ContextVar("devices", default=1)  # by the program that this thread is tracing
 
 
 def exact_products(function: Callable[P, T]) -> Callable[P, T]:
@@ -35,26 +35,26 @@ def exact_products(function: Callable[P, T]) -> Callable[P, T]:
     return call
 
 
-def compiled(function: Callable[P, T]) -> Callable[P, T]:
-    """The function compiled, as by `filter_jit`, with what it hands to `over_devices` split over all of them."""
+def compile_for_devices(function: Callable[P, T]) -> Callable[P, T]:
+    """The function compiled, as by `filter_jit`, with what it hands to `shard_rows` split over all of them."""
 
     @filter_jit
     @exact_products
     def program(devices: int, *arguments: P.args, **options: P.kwargs) -> T:
-        before = _in_use.set(devices)
+        before = _device_count.set(devices)
         try:
             return function(*arguments, **options)
         finally:
-            _in_use.reset(before)
+            _device_count.reset(before)
 
     @wraps(function)
     def call(*arguments: P.args, **options: P.kwargs) -> T:
-        return program(_usable(arguments, options), *arguments, **options)
+        return program(_count_devices(arguments, options), *arguments, **options)
 
     return call
 
 
-def _usable(*inputs: Any) -> int:
+def _count_devices(*inputs: Any) -> int:
     """Devices to split over: one where inputs are kept on some, the user has chosen one, or has a mesh of their own."""
     everywhere = jax.local_device_count()
     if everywhere == 1 or jax.default_device.value is not None or jax.sharding.get_abstract_mesh().axis_names:
@@ -65,14 +65,14 @@ def _usable(*inputs: Any) -> int:
     return everywhere
 
 
-def over_devices(function: Callable[[Any], Any], rows: Any, least: int, filled: bool = False) -> Any:
+def shard_rows(function: Callable[[Any], Any], rows: Any, least: int, filled: bool = False) -> Any:
     """function over arrays that share their first axis, and whose results do: as many of its rows on every device.
 
     function: closes over what all rows need. least: rows of a share below which it does not pay. filled: whether shares
     that are not even are filled up; where a row is cheap, to gather what they found takes longer than to find it.
     """
     count = jax.tree.leaves(rows)[0].shape[0]
-    devices = _in_use.get()
+    devices = _device_count.get()
     missing = -count % devices
     if devices == 1 or count < devices * least or (missing and not filled):
         return function(rows)

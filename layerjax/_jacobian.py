@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jax import Array
 from jax.core import Tracer
 
-from layerjax._devices import compiled
+from layerjax._devices import compile_for_devices
 from layerjax.compiling import is_outermost, is_traced
 
 MOST_PARAMETERS = 16
@@ -25,23 +25,23 @@ MOST_SLOPES = 50_000
 """Values times numbers that they are differentiated by: of more, the time to run counts, not that to compile."""
 
 
-def few_parameters(tree: Any, values: int) -> bool:
-    """Whether `by_parameters` pays: of known numbers, `grad` or its like differentiates so many values by a few."""
+def has_few_parameters(tree: Any, values: int) -> bool:
+    """Whether `differentiate_by_parameters` pays: `grad` or its like differentiates so many values by few numbers."""
     leaves = [leaf for leaf in jax.tree.leaves(tree) if isinstance(leaf, Tracer)]
-    if not leaves or not is_outermost() or not all(map(_is_known, leaves)):
+    if not leaves or not is_outermost() or not all(map(_is_concrete, leaves)):
         return False
     count = sum(leaf.size for leaf in leaves)
     return count <= MOST_PARAMETERS and 0 < values * count <= MOST_SLOPES
 
 
-def _is_known(leaf: Any) -> bool:
+def _is_concrete(leaf: Any) -> bool:
     """Whether `grad` or its like differentiates by this number, and nothing else is done to it."""
     primal = getattr(leaf, "primal", None)
     return isinstance(primal, Array) and not isinstance(primal, Tracer) and jnp.issubdtype(leaf.dtype, jnp.floating)
 
 
-def by_parameters(function: Callable[[Any], Array], tree: Any, plain: Any) -> Array:
-    """function(tree), differentiated by what is traced in the tree: see `few_parameters`.
+def differentiate_by_parameters(function: Callable[[Any], Array], tree: Any, plain: Any) -> Array:
+    """function(tree), differentiated by what is traced in the tree: see `has_few_parameters`.
 
     function: of a module, as it is part of the program's key. plain: a tree like it, for derivatives of derivatives.
     """
@@ -73,7 +73,7 @@ def primal(leaf: Any) -> Any:
     return getattr(leaf, "primal", leaf) if isinstance(leaf, Tracer) else leaf
 
 
-@compiled
+@compile_for_devices
 def _with_jacobian(function: Callable[[Any], Array], parameters: Any, rest: Any) -> tuple[Array, Any]:
     def twice(parameters: Any) -> tuple[Array, Array]:
         found = function(eqx.combine(parameters, rest))

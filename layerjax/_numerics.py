@@ -21,7 +21,7 @@ P = ParamSpec("P")
 T = TypeVar("T")
 
 
-def broadcasting(function: Callable[P, T]) -> Callable[P, T]:
+def allow_broadcasting(function: Callable[P, T]) -> Callable[P, T]:
     """The function with arrays of different ranks broadcast, as this package writes them.
 
     Where a user forbids that of their own code (``jax_numpy_rank_promotion``), what is traced here is not theirs.
@@ -47,7 +47,7 @@ def safe_div(numerator: Array, denominator: Array, otherwise: float = 0.0) -> Ar
     return jnp.where(nonzero, numerator / jnp.where(nonzero, denominator, 1.0), otherwise)
 
 
-def decay_between(a: Array, b: Array) -> Array:
+def mean_decay(a: Array, b: Array) -> Array:
     """(exp(-a) - exp(-b)) / (b - a) for a, b >= 0, equal to exp(-a) at a = b; smooth there in both.
 
     Near a = b it is written without |a - b| and min(a, b), whose derivatives at a tie depend on how a compiler rounds.
@@ -62,7 +62,7 @@ def decay_between(a: Array, b: Array) -> Array:
     return jnp.exp(-jnp.where(near, middle, smaller)) * ratio
 
 
-def at_least(x: Array, low: Array | float) -> Array:
+def clamp_min(x: Array, low: Array | float) -> Array:
     """x, or `low` (with derivative 0 in x) where x is smaller; where they are equal, the derivative is that of x.
 
     In place of jnp.maximum, whose derivative asks which argument *equals* the result: compiled, both may have been
@@ -72,7 +72,7 @@ def at_least(x: Array, low: Array | float) -> Array:
     return jnp.where(x >= low, x, low)
 
 
-def not_negative(x: Array) -> Array:
+def clamp_nonnegative(x: Array) -> Array:
     """x, or 0 where it is negative; with the derivative of x where rounding alone may have made it so.
 
     For what is a difference of numbers of the order of 1, and 0 at the end of a range.
@@ -82,7 +82,7 @@ def not_negative(x: Array) -> Array:
     return jnp.where(inside, x - jax.lax.stop_gradient(jnp.minimum(x, 0.0)), 0.0)
 
 
-def at_most(x: Array, high: Array | float) -> Array:
+def clamp_max(x: Array, high: Array | float) -> Array:
     """x, or `high` (with derivative 0 in x) where x is larger; where they are equal, the derivative is that of x."""
     return jnp.where(x <= high, x, high)
 
@@ -98,7 +98,7 @@ def horner(coefficients: Array | Sequence[Any], x: Array) -> Array:
     return functools.reduce(lambda total, coefficient: coefficient + x * total, coefficients[::-1])
 
 
-def unstacked(x: Array) -> list[Array]:
+def unstack(x: Array) -> list[Array]:
     """The rows of an array; their derivatives are stacked again, and not a sum of arrays of which most is 0."""
     return [row.squeeze(0) for row in jax.lax.split(x, (1,) * x.shape[0])]
 

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from layerjax._checks import in_short
+from layerjax._checks import abbreviate
 
 RANGES: dict[str, tuple[float, float]] = {
     "Interface.ior": (0.25, 4.0),
@@ -90,7 +90,7 @@ def parameter(
     def convert(value: Any) -> Any:
         if (optional and value is None) or is_placeholder(value):
             return value
-        array = _shaped(name, value)
+        array = _check_shape(name, value)
         if ranged:
             check_range(name, array)
         return array
@@ -100,7 +100,7 @@ def parameter(
     return eqx.field(converter=convert, default=default)
 
 
-def floating(name: str, value: Any) -> jax.Array:
+def as_floating(name: str, value: Any) -> jax.Array:
     """The value as an array of the default floating type, or of its own if it is a floating JAX array.
 
     A plain number stays one under ``jit``, where it would be traced like all else: what is known of it still counts.
@@ -116,7 +116,7 @@ def floating(name: str, value: Any) -> jax.Array:
                 array = array.astype(jnp.result_type(float))
             return jax.lax.convert_element_type(array, array.dtype)  # drops the weak type: one program for all numbers
     except (TypeError, ValueError, OverflowError):
-        raise ValueError(f"{name}: {in_short(value)} is not a number or an array of real numbers") from None
+        raise ValueError(f"{name}: {abbreviate(value)} is not a number or an array of real numbers") from None
 
 
 def takes_several(name: str) -> bool:
@@ -124,12 +124,12 @@ def takes_several(name: str) -> bool:
     return name in PER_CHANNEL or name in VECTORS or name not in RANGES
 
 
-def _shaped(name: str, value: Any) -> jax.Array:
-    array = floating(name, value)
+def _check_shape(name: str, value: Any) -> jax.Array:
+    array = as_floating(name, value)
     if array.ndim and 0 in array.shape:
         raise ValueError(f"{name}: shape {array.shape} given, which holds no number")
     if isinstance(value, list | tuple) and not takes_several(name):
-        raise ValueError(f"{name}: {in_short(value)} given, must be one number; of a map of stacks it is an array")
+        raise ValueError(f"{name}: {abbreviate(value)} given, must be one number; of a map of stacks it is an array")
     return array
 
 
@@ -156,7 +156,7 @@ def plain_name(path: str) -> str:
     return _WEIGHT.sub(r"weights.\1", _PART.sub(r"\1", path)).lstrip(".")
 
 
-def in_precision(tree: Any, dtype: jnp.dtype) -> Any:
+def cast_arrays(tree: Any, dtype: jnp.dtype) -> Any:
     """Arrays of the tree in the floating type of the directions, which decide the precision of the computation."""
     cast = partial(jax.lax.convert_element_type, new_dtype=dtype)
     return jax.tree.map(lambda leaf: cast(leaf) if eqx.is_inexact_array(leaf) and leaf.dtype != dtype else leaf, tree)

@@ -37,7 +37,7 @@ class Number(NamedTuple):
     by_channel: bool
 
     @property
-    def of_map(self) -> int:
+    def map_axes(self) -> int:
         """Axes of the map."""
         return len(self.shape) - self.channel_axes
 
@@ -106,16 +106,16 @@ def map_shape(stack: Any) -> Shape:
         ValueError: shapes that do not go together, or that may count texels as well as channels.
     """
     found = list(numbers_of(stack))
-    axes = max((number.of_map for number in found), default=0)
+    axes = max((number.map_axes for number in found), default=0)
     if axes == 0:
         return ()
-    mapped = [number for number in found if number.of_map]
+    mapped = [number for number in found if number.map_axes]
     for number in mapped:
-        if number.of_map != axes:
+        if number.map_axes != axes:
             raise ValueError(
                 f"Stack.{number.name}: shape {number.shape} given, where "
-                f"{next(other.name for other in mapped if other.of_map == axes)} makes it a map of {axes} "
-                f"{'axis' if axes == 1 else 'axes'}: {_wanted(number, axes)}"
+                f"{next(other.name for other in mapped if other.map_axes == axes)} makes it a map of {axes} "
+                f"{'axis' if axes == 1 else 'axes'}: {_expected_shape(number, axes)}"
             )
     try:
         shape = np.broadcast_shapes(*(number.shape[:axes] for number in mapped))
@@ -127,13 +127,13 @@ def map_shape(stack: Any) -> Shape:
         if (
             number.by_channel
             and axes == 1
-            and not number.of_map
+            and not number.map_axes
             and number.channel_axes
             and number.shape == shape != (1,)
         ):
             raise ValueError(
                 f"Stack.{number.name}: shape {number.shape} given in a map of shape {shape}: texels or channels? "
-                f"{_wanted(number, axes)}, or (1, C) for channels that all texels share"
+                f"{_expected_shape(number, axes)}, or (1, C) for channels that all texels share"
             )
     return shape
 
@@ -143,7 +143,7 @@ def _refuse_square(numbers: list[Number], mapped: list[Number]) -> None:
     number = mapped[0]
     if len(number.shape) != 2 or len({*number.shape}) != 1 or number.shape == (1, 1):
         return
-    others = [other for other in numbers if other.by_channel or other.of_map]
+    others = [other for other in numbers if other.by_channel or other.map_axes]
     if all(other.shape in (number.shape, (), (1,)) for other in others):
         raise ValueError(
             f"Stack.{number.name}: shape {number.shape} given, and nothing else says whether these are texels or "
@@ -152,7 +152,7 @@ def _refuse_square(numbers: list[Number], mapped: list[Number]) -> None:
         )
 
 
-def _wanted(number: Number, axes: int) -> str:
+def _expected_shape(number: Number, axes: int) -> str:
     texels = ", ".join("HW" if axes == 2 else "N" * axes)
     if number.by_channel:
         return f"({texels}, 1) is a number a texel, ({texels}, C) one a channel of each"
@@ -162,7 +162,7 @@ def _wanted(number: Number, axes: int) -> str:
 def require_single(stack: Any, who: str) -> None:
     """Refuse a map of stacks, on behalf of what takes one stack alone."""
     if map_shape(stack):
-        number = next(number for number in numbers_of(stack) if number.of_map)
+        number = next(number for number in numbers_of(stack) if number.map_axes)
         raise ValueError(
             f"stack: {who} takes one stack; {number.name} of shape {number.shape} makes it a map of stacks, "
             "which evaluate, sample, pdf, albedo and unscattered take"
@@ -171,6 +171,6 @@ def require_single(stack: Any, who: str) -> None:
 
 def axes_of_map(stack: Any, shape: Shape) -> Any:
     """A tree like the stack's: for every leaf whether it differs from texel to texel of a map of this shape."""
-    mapped = {number.name for number in numbers_of(stack) if number.of_map == len(shape)}
+    mapped = {number.name for number in numbers_of(stack) if number.map_axes == len(shape)}
     named = [name in mapped for name, _ in leaves_with_names(stack)]
     return jax.tree.unflatten(jax.tree.structure(stack), named)

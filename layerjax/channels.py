@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from layerjax._numerics import unstacked
+from layerjax._numerics import unstack
 
 Channels = tuple[Array, ...]
 """One array for all channels, or one for each."""
@@ -30,12 +30,12 @@ def count(*values: Sequence[Array]) -> int:
     return max((len(value) for value in values), default=1)
 
 
-def each(function: Callable[..., Array], *values: Sequence[Array]) -> Channels:
+def map_channels(function: Callable[..., Array], *values: Sequence[Array]) -> Channels:
     """The function of the values of each channel; computed once where every value serves all channels."""
     return tuple(function(*(pick(value, c) for value in values)) for c in range(max(1, count(*values))))
 
 
-def by_channel(function: Callable[[Any], Array], tree: Any) -> Channels:
+def vmap_channels(function: Callable[[Any], Array], tree: Any) -> Channels:
     """The function of a tree of parameters of one channel, for all channels along an axis of one program.
 
     It is computed once where no parameter differs between channels.
@@ -50,26 +50,26 @@ def by_channel(function: Callable[[Any], Array], tree: Any) -> Channels:
         return function(jax.tree.unflatten(structure, [next(left) if jnp.ndim(leaf) else leaf for leaf in leaves]))
 
     channels = max(len(leaf) for leaf in differing)
-    return tuple(unstacked(jax.vmap(of_one)([jnp.broadcast_to(leaf, channels) for leaf in differing])))
+    return tuple(unstack(jax.vmap(of_one)([jnp.broadcast_to(leaf, channels) for leaf in differing])))
 
 
-def times(*factors: Sequence[Array]) -> Channels:
+def multiply(*factors: Sequence[Array]) -> Channels:
     """Product, channel by channel."""
-    return each(lambda *values: reduce(operator.mul, values), *factors)
+    return map_channels(lambda *values: reduce(operator.mul, values), *factors)
 
 
 def total(parts: Sequence[Sequence[Array]], zero: Array | None = None) -> Channels:
     """Sum, channel by channel; `zero` if there is nothing to add."""
     if not parts and zero is not None:
         return (zero,)
-    return each(lambda *values: reduce(operator.add, values), *parts)
+    return map_channels(lambda *values: reduce(operator.add, values), *parts)
 
 
 def select(chosen: Array, values: Sequence[Array], others: Sequence[Array] | None = None) -> Channels:
     """`values` where chosen, else `others` (0 without them)."""
     if others is None:
         return tuple(jnp.where(chosen, value, 0.0) for value in values)
-    return each(lambda value, other: jnp.where(chosen, value, other), values, others)
+    return map_channels(lambda value, other: jnp.where(chosen, value, other), values, others)
 
 
 def mean(values: Sequence[Array]) -> Array:

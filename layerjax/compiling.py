@@ -18,7 +18,7 @@ from jax.core import Tracer
 P = ParamSpec("P")
 T = TypeVar("T")
 
-FOLDER, LEAST = "jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs"
+CACHE_DIRECTORY, CACHE_LEAST_TIME = "jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs"
 """JAX's settings of its persistent compilation cache."""
 
 LEAST_COMPILE = 0.1
@@ -46,15 +46,17 @@ def compiler_options() -> dict[str, Any]:
         >>> program(stack).shape
         (1,)
     """
-    return dict(_known())
+    return dict(_supported_options())
 
 
 @cache
-def _known() -> dict[str, Any]:
-    return {name: value for name, value in OPTIONS.items() if jax.default_backend() == "cpu" and _is_known(name, value)}
+def _supported_options() -> dict[str, Any]:
+    return {
+        name: value for name, value in OPTIONS.items() if jax.default_backend() == "cpu" and _is_supported(name, value)
+    }
 
 
-def _is_known(name: str, value: Any) -> bool:
+def _is_supported(name: str, value: Any) -> bool:
     try:
         jax.jit(lambda x: x + 1.0, compiler_options={name: value})(0.0)
     except Exception as error:  # XLA's own kinds differ between versions
@@ -109,20 +111,20 @@ def keep_programs() -> str | None:
         >>> import layerjax as lj
         >>> folder = lj.keep_programs()
     """
-    if jax.config.values[FOLDER] or not (folder := compile_cache()):
-        return jax.config.values[FOLDER]
-    jax.config.update(FOLDER, folder)
-    jax.config.update(LEAST, LEAST_COMPILE)
+    if jax.config.values[CACHE_DIRECTORY] or not (folder := compile_cache()):
+        return jax.config.values[CACHE_DIRECTORY]
+    jax.config.update(CACHE_DIRECTORY, folder)
+    jax.config.update(CACHE_LEAST_TIME, LEAST_COMPILE)
     return folder
 
 
 @contextmanager
-def programs_kept() -> Iterator[None]:
-    """`keep_programs` within the block alone; arrays of different ranks broadcast in it (see `broadcasting`)."""
+def program_cache() -> Iterator[None]:
+    """`keep_programs` within the block alone; arrays of different ranks broadcast in it (see `allow_broadcasting`)."""
     from jax.experimental.compilation_cache.compilation_cache import reset_cache
 
-    before = {name: jax.config.values[name] for name in (FOLDER, LEAST)}
-    if before[FOLDER] or not keep_programs():
+    before = {name: jax.config.values[name] for name in (CACHE_DIRECTORY, CACHE_LEAST_TIME)}
+    if before[CACHE_DIRECTORY] or not keep_programs():
         with jax.numpy_rank_promotion("allow"):
             yield
         return

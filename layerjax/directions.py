@@ -22,7 +22,7 @@ from jax.typing import ArrayLike
 
 from layerjax._checks import require_choice
 from layerjax._numerics import horizon, safe_sqrt
-from layerjax._parameters import floating
+from layerjax._parameters import as_floating
 
 Vector = tuple[Array, Array, Array]
 Factor = Array | float
@@ -56,7 +56,7 @@ def direction(theta: ArrayLike, phi: ArrayLike, *, degrees: bool = False) -> Arr
     """
     require_choice("degrees", degrees, (True, False))
     with jax.ensure_compile_time_eval():  # known angles give known directions, under jit too
-        polar, azimuth = floating("theta", theta), floating("phi", phi)
+        polar, azimuth = as_floating("theta", theta), as_floating("phi", phi)
         if (size := _size(theta)) > (180.0 if degrees else np.pi) + ANGLE_SLACK:
             limit = " degrees is outside [-180, 180]" if degrees else f" is outside [-pi, pi]; {IN_DEGREES}"
             raise ValueError(f"theta: {size:g}{limit}")
@@ -78,7 +78,7 @@ def _size(angles: ArrayLike) -> float:
 
 def angles(w: ArrayLike) -> tuple[Array, Array]:
     """Polar angle in [0, pi] and azimuth in (-pi, pi] of directions ``(..., 3)``, in radians, shape ``(...)`` each."""
-    x, y, z = split(floating("w", w))
+    x, y, z = split(as_floating("w", w))
     planar = x * x + y * y
     at_pole = planar == 0  # the azimuth is undefined there: give 0, with gradient 0
     azimuth = jnp.where(at_pole, 0.0, jnp.arctan2(jnp.where(at_pole, 0.0, y), jnp.where(at_pole, 1.0, x)))
@@ -155,7 +155,7 @@ def is_above(w: Vector) -> Array:
     return w[2] > horizon(w[2].dtype)
 
 
-def sanitised(w: Vector, valid: Array | None = None) -> Vector:
+def sanitise(w: Vector, valid: Array | None = None) -> Vector:
     """w, with an interior stand-in for its cosine where it is not valid (not above the horizon, if not said).
 
     What is computed of the stand-in is finite, with finite derivatives, and is to be thrown away.
@@ -231,7 +231,7 @@ def read_directions(**named: ArrayLike) -> list[Array]:
     Concrete ones must be of unit length (within 1e-3). Traced ones have no length yet: it is up to the caller.
     """
     with jax.ensure_compile_time_eval():  # what is known while a program is traced is looked at as well
-        arrays = [floating(name, value) for name, value in named.items()]
+        arrays = [as_floating(name, value) for name, value in named.items()]
         for name, array in zip(named, arrays, strict=True):
             if array.ndim < 1 or array.shape[-1] != 3:
                 raise ValueError(f"{name}: shape {array.shape} given, (..., 3) needed")

@@ -15,28 +15,35 @@ from jax import Array
 from jax.typing import ArrayLike
 
 from layerjax import maps
-from layerjax._batching import in_chunks
+from layerjax._batching import map_direction_chunks
 from layerjax._checks import require_choice, require_count, require_key
-from layerjax._devices import compiled
-from layerjax._jacobian import by_parameters, few_parameters
-from layerjax._numerics import broadcasting, horizon, safe_div
-from layerjax._parameters import in_precision
+from layerjax._devices import compile_for_devices
+from layerjax._jacobian import differentiate_by_parameters, has_few_parameters
+from layerjax._numerics import allow_broadcasting, horizon, safe_div
+from layerjax._parameters import cast_arrays
 from layerjax._shapes import Shape, channel_count, map_shape, require_single
 from layerjax.channels import pick
 from layerjax.compiling import is_traced
 from layerjax.directions import Vector, horizontal, read_directions, split
 from layerjax.mixture import Mixture, require_material
 from layerjax.numerical_error import neighbours, numerical_error
-from layerjax.preparation import Prepared, chosen_for, prepare, prepare_at, prepared_at, prepared_for_energies
+from layerjax.preparation import (
+    Prepared,
+    ensure_prepared,
+    ensure_prepared_for_albedo,
+    prepare,
+    prepare_for_directions,
+    resolve_transport,
+)
 from layerjax.stack import Stack, media_of, optical_depths, require_numbers, simplify
 from layerjax.transport import Side, Transport
 from layerjax.transport.known_directions import (
     MOST_COSINES,
-    Known,
+    DirectionLookup,
     KnownDirections,
     known_above,
     known_directions,
-    own_cosines,
+    separate_cosines,
 )
 
 
@@ -70,7 +77,7 @@ def evaluate(
     return evaluate_known(stack, wi, wo, transport, side=side, key=key)
 
 
-@broadcasting
+@allow_broadcasting
 def evaluate_known(
     stack: Any,
     wi: ArrayLike,
@@ -89,13 +96,13 @@ def evaluate_known(
     """
     require_choice("side", side, get_args(Side))
     wi, wo = read_directions(wi=wi, wo=wo)
-    if known is not None and (known.of_wi.shape, known.of_wo.shape) != (wi.shape[:-1], wo.shape[:-1]):
+    if known is not None and (known.wi_index.shape, known.wo_index.shape) != (wi.shape[:-1], wo.shape[:-1]):
         raise ValueError(
-            f"known: it is of directions of shapes {known.of_wi.shape} and {known.of_wo.shape}, "
+            f"known: it is of directions of shapes {known.wi_index.shape} and {known.wo_index.shape}, "
             f"wi and wo have {wi.shape[:-1]} and {wo.shape[:-1]}"
         )
     if isinstance(stack, Mixture):
-        return _of_parts(stack).mean(
+        return _broadcast_parts(stack).mean(
             lambda part, subkey: evaluate_known(part, wi, wo, transport, side=side, key=subkey, known=known), key
         )
     shape = _shape_of(stack)
@@ -104,20 +111,22 @@ def evaluate_known(
     looked = cache(lambda: known_directions(wi, wo) if known is None else known)
     if not isinstance(stack, Prepared) and is_traced(stack) and not is_traced(wi, wo):
         values = math.prod(jnp.broadcast_shapes(wi.shape, wo.shape)[:-1]) * channel_count(stack)
-        if few_parameters(stack, values):
+        if has_few_parameters(stack, values):
             require_numbers(stack)
-            chosen, simplified = chosen_for(stack, transport, looked)
-            traced = chosen.for_tracing(simplified, looked)
+            chosen, simplified = resolve_transport(stack, transport, looked)
+            traced = chosen.traceable_equivalent(simplified, looked)
             if traced is not None:
-                chosen.needed(key, "evaluate")
-                directions = looked() if chosen.uses_known else None
+                chosen.resolve_key(key, "evaluate")
+                directions = looked() if chosen.uses_known_directions else None
                 more = (directions, wi, wo, side, channel_count(stack))
-                return by_parameters(_evaluate_whole, (simplified, traced, *more), (simplified, chosen, *more))
-    prepared = prepared_at(stack, transport, wi.dtype, looked)
-    return _evaluate(prepared, wi, wo, side, prepared.transport.needed(key, "evaluate"))[0]
+                return differentiate_by_parameters(
+                    _evaluate_whole, (simplified, traced, *more), (simplified, chosen, *more)
+                )
+    prepared = ensure_prepared(stack, transport, wi.dtype, looked)
+    return _evaluate(prepared, wi, wo, side, prepared.transport.resolve_key(key, "evaluate"))[0]
 
 
-@broadcasting
+@allow_broadcasting
 def evaluate_with_error(
     stack: Stack | Mixture | Prepared,
     wi: ArrayLike,
@@ -142,20 +151,20 @@ def evaluate_with_error(
     if _shape_of(stack):
         require_single(stack, "evaluate_with_error")
     if isinstance(stack, Mixture):
-        return _mixed_with_error(stack, wi, wo, transport, side, key)
+        return _mixture_with_error(stack, wi, wo, transport, side, key)
     around = cache(partial(neighbours, wi, wo))  # walks need none
     known = cache(lambda: known_directions(*around()))
-    prepared = prepared_at(stack, transport, wi.dtype, known)
-    key = prepared.transport.needed(key, "evaluate_with_error")
-    others = _compared(stack, prepared.transport, known)  # refuses before anything is evaluated
+    prepared = ensure_prepared(stack, transport, wi.dtype, known)
+    key = prepared.transport.resolve_key(key, "evaluate_with_error")
+    others = _prepare_comparisons(stack, prepared.transport, known)  # refuses before anything is evaluated
     if others is not None:
-        return numerical_error(prepared, in_precision(others, wi.dtype), *around(), side)
+        return numerical_error(prepared, cast_arrays(others, wi.dtype), *around(), side)
     values, errors = _evaluate(prepared, wi, wo, side, key)
     assert errors is not None
     return values, errors
 
 
-@broadcasting
+@allow_broadcasting
 def sample(
     stack: Stack | Mixture | Prepared, wi: ArrayLike, key: Array, transport: Transport | Literal["auto"] = "auto"
 ) -> tuple[Array, Array, Array]:
@@ -172,12 +181,12 @@ def sample(
         return _sample_mixture(stack, wi, key, transport)
     shape = _shape_of(stack)
     if shape:
-        mapped, chosen, at = _mapped(stack, transport, shape, wi)
-        return maps.draws(mapped, chosen, at, at.spread(wi), channel_count(stack), key)
-    return _sample(prepared_at(stack, transport, wi.dtype), wi, key)
+        mapped, chosen, layout = _resolve_map(stack, transport, shape, wi)
+        return maps.draws(mapped, chosen, layout, layout.broadcast(wi), channel_count(stack), key)
+    return _sample(ensure_prepared(stack, transport, wi.dtype), wi, key)
 
 
-@broadcasting
+@allow_broadcasting
 def pdf(
     stack: Stack | Mixture | Prepared, wi: ArrayLike, wo: ArrayLike, transport: Transport | Literal["auto"] = "auto"
 ) -> Array:
@@ -187,15 +196,15 @@ def pdf(
     """
     wi, wo = read_directions(wi=wi, wo=wo)
     if isinstance(stack, Mixture):
-        return _of_parts(stack).mean(lambda part, _: pdf(part, wi, wo, transport), by_channel=False)
+        return _broadcast_parts(stack).mean(lambda part, _: pdf(part, wi, wo, transport), by_channel=False)
     shape = _shape_of(stack)
     if shape:
-        mapped, chosen, at = _mapped(stack, transport, shape, wi, wo)
-        return maps.densities(mapped, chosen, at, (at.spread(wi), at.spread(wo)))
-    return _pdf(prepared_at(stack, transport, wi.dtype), wi, wo)
+        mapped, chosen, layout = _resolve_map(stack, transport, shape, wi, wo)
+        return maps.densities(mapped, chosen, layout, (layout.broadcast(wi), layout.broadcast(wo)))
+    return _pdf(ensure_prepared(stack, transport, wi.dtype), wi, wo)
 
 
-@broadcasting
+@allow_broadcasting
 def albedo(
     stack: Stack | Mixture | Prepared,
     wi: ArrayLike,
@@ -215,17 +224,19 @@ def albedo(
     require_count("nodes", nodes, 1)
     (wi,) = read_directions(wi=wi)
     if isinstance(stack, Mixture):
-        return _of_parts(stack).mean(lambda part, subkey: albedo(part, wi, transport, nodes=nodes, key=subkey), key)
+        return _broadcast_parts(stack).mean(
+            lambda part, subkey: albedo(part, wi, transport, nodes=nodes, key=subkey), key
+        )
     shape = _shape_of(stack)
     if shape:
-        mapped, chosen, at = _mapped(stack, transport, shape, wi)
-        given = chosen.needed(key, "albedo")
-        return maps.energies(mapped, chosen, at, at.spread(wi), channel_count(stack), nodes, given)
-    prepared = prepared_for_energies(stack, transport, wi.dtype)
-    return _albedo(prepared, wi, nodes, prepared.transport.needed(key, "albedo"))
+        mapped, chosen, layout = _resolve_map(stack, transport, shape, wi)
+        given = chosen.resolve_key(key, "albedo")
+        return maps.albedos(mapped, chosen, layout, layout.broadcast(wi), channel_count(stack), nodes, given)
+    prepared = ensure_prepared_for_albedo(stack, transport, wi.dtype)
+    return _albedo(prepared, wi, nodes, prepared.transport.resolve_key(key, "albedo"))
 
 
-@broadcasting
+@allow_broadcasting
 def unscattered(stack: Stack | Mixture, wi: ArrayLike) -> Array:
     """Share of radiance along wi that passes the stack without a collision, shape ``(..., C)``.
 
@@ -236,43 +247,43 @@ def unscattered(stack: Stack | Mixture, wi: ArrayLike) -> Array:
     require_numbers(stack)
     (wi,) = read_directions(wi=wi)
     if isinstance(stack, Mixture):
-        return _of_parts(stack).mean(lambda part, _: unscattered(part, wi))
-    slim, channels, shape = in_precision(simplify(stack), wi.dtype), channel_count(stack), map_shape(stack)
+        return _broadcast_parts(stack).mean(lambda part, _: unscattered(part, wi))
+    slim, channels, shape = cast_arrays(simplify(stack), wi.dtype), channel_count(stack), map_shape(stack)
     if shape:
-        return maps.of_directions(_unscattered, slim, maps.layout(shape, wi), wi, channels)
+        return maps.evaluate_texels(_unscattered, slim, maps.layout(shape, wi), wi, channels)
     return _unscattered(slim, wi, channels)
 
 
 def _evaluate_whole(inputs: tuple[Stack, Transport, KnownDirections | None, Array, Array, Side, int]) -> Array:
     stack, transport, known, wi, wo, side, channels = inputs
-    prepared = Prepared(transport.prepare_for(stack, lambda: known), transport, channels)
-    return _evaluate(in_precision(prepared, wi.dtype), wi, wo, side, None)[0]
+    prepared = Prepared(transport.prepare_for_directions(stack, lambda: known), transport, channels)
+    return _evaluate(cast_arrays(prepared, wi.dtype), wi, wo, side, None)[0]
 
 
-@compiled
+@compile_for_devices
 def _evaluate(prepared: Prepared, wi: Array, wo: Array, side: Side, key: Array | None) -> tuple[Array, Array | None]:
-    return prepared.transport.measured(prepared.state, wi, wo, side, prepared.channels, key)
+    return prepared.transport.evaluate_batch(prepared.state, wi, wo, side, prepared.channels, key)
 
 
-@compiled
+@compile_for_devices
 def _sample(prepared: Prepared, wi: Array, key: Array) -> tuple[Array, Array, Array]:
-    return prepared.transport.drawn(prepared.state, wi, prepared.channels, key)
+    return prepared.transport.sample_batch(prepared.state, wi, prepared.channels, key)
 
 
-@compiled
+@compile_for_devices
 def _pdf(prepared: Prepared, wi: Array, wo: Array) -> Array:
     def density(wi: Vector, wo: Vector) -> tuple[Array, ...]:
         return (prepared.transport.pdf(prepared.state, wi, wo),)
 
-    return in_chunks(density, wi, wo)[..., 0]
+    return map_direction_chunks(density, wi, wo)[..., 0]
 
 
-@compiled
+@compile_for_devices
 def _albedo(prepared: Prepared, wi: Array, nodes: int, key: Array | None) -> tuple[Array, Array]:
-    return prepared.transport.energies(prepared.state, wi, prepared.channels, nodes, key)
+    return prepared.transport.albedo_batch(prepared.state, wi, prepared.channels, nodes, key)
 
 
-@compiled
+@compile_for_devices
 def _unscattered(stack: Stack, wi: Array, channels: int) -> Array:
     x, y, z = split(wi)
     media = media_of(stack)
@@ -284,16 +295,16 @@ def _unscattered(stack: Stack, wi: Array, channels: int) -> Array:
     return jnp.stack([jnp.where(visible, jnp.exp(-total), 0.0) for total in totals], axis=-1)
 
 
-def _of_parts(mixture: Mixture) -> Mixture:
+def _broadcast_parts(mixture: Mixture) -> Mixture:
     require_numbers(mixture)
-    return mixture.over(map_shape(mixture))
+    return mixture.broadcast_parts(map_shape(mixture))
 
 
-def _mixed_with_error(
+def _mixture_with_error(
     mixture: Mixture, wi: Array, wo: Array, transport: Any, side: Side, key: Array | None
 ) -> tuple[Array, Array]:
     """Standard errors of independent walks add in squares, numerical errors as they are."""
-    found = mixture.weighed(
+    found = mixture.weighted_values(
         lambda part, subkey: evaluate_with_error(part, wi, wo, transport, side=side, key=subkey), key
     )
     values = sum(share * value for share, (value, _) in found)
@@ -312,10 +323,10 @@ def _is_random(material: Any, transport: Any) -> bool:
 def _sample_mixture(mixture: Mixture, wi: Array, key: Array, transport: Any) -> tuple[Array, Array, Array]:
     """A draw from every part, of which one is chosen by weight: its density is the mean of all."""
     shape = map_shape(mixture)
-    mixture = _of_parts(mixture) if shape else prepare(mixture, transport)
+    mixture = _broadcast_parts(mixture) if shape else prepare(mixture, transport)
     wi = jnp.broadcast_to(wi, (*jnp.broadcast_shapes(shape, wi.shape[:-1]), 3))
     draws, choice, values = jax.random.split(key, 3)
-    found = mixture.weighed(lambda part, subkey: sample(part, wi, subkey, transport)[:2], draws)
+    found = mixture.weighted_values(lambda part, subkey: sample(part, wi, subkey, transport)[:2], draws)
     pick = jax.random.uniform(choice, wi.shape[:-1], wi.dtype)
     passed, (wo, own) = found[0]
     for share, (drawn, density) in found[1:]:
@@ -334,40 +345,42 @@ def _shape_of(stack: Stack | Mixture | Prepared) -> Shape:
     return () if isinstance(stack, Prepared) else map_shape(stack)
 
 
-def _mapped(
-    stack: Any, transport: Any, shape: Shape, *directions: Array, known: Known = lambda: None
+def _resolve_map(
+    stack: Any, transport: Any, shape: Shape, *directions: Array, known: DirectionLookup = lambda: None
 ) -> tuple[Stack, Transport, maps.Layout]:
     """A simplified map of stacks in the precision of the directions, its transport, and how these lie over it."""
-    at = maps.layout(shape, *directions)
-    chosen, simplified = chosen_for(stack, transport, known)
-    return in_precision(simplified, directions[0].dtype), chosen, at
+    layout = maps.layout(shape, *directions)
+    chosen, simplified = resolve_transport(stack, transport, known)
+    return cast_arrays(simplified, directions[0].dtype), chosen, layout
 
 
 def _evaluate_map(
     stack: Any, wi: Array, wo: Array, transport: Any, side: Side, key: Array | None, shape: Shape
 ) -> Array:
-    at = maps.layout(shape, wi, wo)
-    directions = at.spread(wi), at.spread(wo)
-    pairs = math.prod(at.ahead)
-    own_known = not at.shared and 0 < 2 * pairs <= MOST_COSINES
-    first = [w if at.shared else w[0] for w in directions] if pairs and not at.empty else None
+    layout = maps.layout(shape, wi, wo)
+    directions = layout.broadcast(wi), layout.broadcast(wo)
+    pairs = math.prod(layout.outer_axes)
+    own_known = not layout.shared and 0 < 2 * pairs <= MOST_COSINES
+    first = [w if layout.shared else w[0] for w in directions] if pairs and not layout.empty else None
     known, above = None, own_known and known_above(wi, wo)
     if first is not None:
-        known = own_cosines(first[0], first[1], above) if own_known else known_directions(*first)
-    mapped, chosen, _ = _mapped(stack, transport, shape, wi, wo, known=lambda: known)
-    given, channels = chosen.needed(key, "evaluate"), channel_count(stack)
-    if not chosen.uses_known:
+        known = separate_cosines(first[0], first[1], above) if own_known else known_directions(*first)
+    mapped, chosen, _ = _resolve_map(stack, transport, shape, wi, wo, known=lambda: known)
+    given, channels = chosen.resolve_key(key, "evaluate"), channel_count(stack)
+    if not chosen.uses_known_directions:
         known, own_known = None, False
     own = maps.TexelDirections(own_known, above)
-    return maps.values(mapped, chosen, at, directions, side, channels, given, None if own_known else known, own)
+    return maps.values(mapped, chosen, layout, directions, side, channels, given, None if own_known else known, own)
 
 
-def _compared(stack: Stack | Prepared, transport: Transport, known: Known) -> list[Prepared] | None:
+def _prepare_comparisons(
+    stack: Stack | Prepared, transport: Transport, known: DirectionLookup
+) -> list[Prepared] | None:
     """The stack prepared for the transports of an error estimate; None, if it knows errors itself."""
-    others = transport.compared()
+    others = transport.comparison_transports()
     if others is None:
         return None
     if isinstance(stack, Prepared):
         name = type(transport).__name__
         raise ValueError(f"stack: {name} estimates its error at other resolutions and needs the Stack, not a Prepared")
-    return [prepare_at(stack, other, known) for other in others]
+    return [prepare_for_directions(stack, other, known) for other in others]

@@ -6,7 +6,7 @@ Arguments broadcast against each other; a reflectance has their common shape and
 import jax.numpy as jnp
 from jax import Array
 
-from layerjax._numerics import at_least, at_most, horner, safe_div, safe_sqrt
+from layerjax._numerics import clamp_max, clamp_min, horner, safe_div, safe_sqrt
 from layerjax.directions import squared_cosine_of_refraction
 
 ROUNDED_ROOT = (308 / 1536, 1080 / 1536, 924 / 1536, -432 / 1536, -660 / 1536, 120 / 1536, 196 / 1536)
@@ -21,7 +21,7 @@ def schlick(cosine: Array, f0: Array | float) -> Array:
         cosine: cosine between the direction of incidence and the facet normal, in [0, 1].
         f0: reflectance along the normal, in [0, 1].
     """
-    complement = at_least(1.0 - cosine, 0.0)  # a cosine may round to just above 1
+    complement = clamp_min(1.0 - cosine, 0.0)  # a cosine may round to just above 1
     squared = complement * complement
     fifth = squared * squared * complement
     return f0 + (1.0 - f0) * fifth
@@ -62,7 +62,7 @@ def cosine_of_refraction(cosine: Array, ior: Array, blur: Array | None = None) -
     refracted = jnp.sqrt(jnp.where(transmits, squared, 1.0))
     if blur is None:
         return refracted, transmits
-    blur = at_most(blur, 0.5 * at_least((1.0 - ior) * (1.0 + ior), 0.0) / (ior * ior))
+    blur = clamp_max(blur, 0.5 * clamp_min((1.0 - ior) * (1.0 + ior), 0.0) / (ior * ior))
     near = jnp.abs(squared) < blur
     width = jnp.where(near, blur, 1.0)
     rounded = jnp.sqrt(width) * horner(ROUNDED_ROOT, jnp.where(near, squared, 0.0) / width)

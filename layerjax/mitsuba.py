@@ -52,7 +52,7 @@ def bsdf(stack: Stack | Mixture, transport: Any = "auto", id: str = "layerjax") 
     """
     properties = mi.Properties(NAME)
     properties.set_id(id)
-    return _plugin(mi.variant())(properties, Material(stack, transport))
+    return _plugin(mi.variant())(properties, PluginMaterial(stack, transport))
 
 
 def register() -> None:
@@ -69,7 +69,7 @@ def register() -> None:
     mi.register_bsdf(NAME, _plugin(variant))
 
 
-class Material:
+class PluginMaterial:
     """A stack as the plugin holds it. numbers: arrays of Dr.Jit, by the names that `mi.traverse` shows."""
 
     def __init__(self, stack: Stack | Mixture, transport: Any):
@@ -82,9 +82,9 @@ class Material:
         self.transport = choose_transport(stack, transport=transport)
         self.numbers = {name: _array(name, leaf) for name, leaf in leaves_with_names(stack)}
         self.is_random = self.transport.random
-        self._take(stack)
+        self._set_stack(stack)
 
-    def _take(self, stack: Stack | Mixture) -> None:
+    def _set_stack(self, stack: Stack | Mixture) -> None:
         self.stack, self.prepared = stack, prepare(stack, self.transport)
         layers = [simplify(part).layers for part in stacks_of(stack) if part.base is None]
         interfaces = [[layer.ior for layer in one if isinstance(layer, Interface)] for one in layers]
@@ -98,11 +98,11 @@ class Material:
         Raises:
             ValueError: one is out of its range.
         """
-        found = self.with_numbers({name: jnp.asarray(np.array(value)) for name, value in self.numbers.items()})
+        found = self.replace_numbers({name: jnp.asarray(np.array(value)) for name, value in self.numbers.items()})
         _check(found)
-        self._take(found)
+        self._set_stack(found)
 
-    def with_numbers(self, values: dict[str, Array]) -> Any:
+    def replace_numbers(self, values: dict[str, Array]) -> Any:
         """The stack with these numbers, each in the shape that it has there, and its own where there is none."""
         leaves = [jnp.reshape(values.get(name, leaf), leaf.shape) for name, leaf in leaves_with_names(self.stack)]
         return jax.tree.unflatten(jax.tree.structure(self.stack), leaves)
@@ -113,21 +113,21 @@ class Material:
         def values_of(numbers: Any, light: Any, viewer: Any, *place: Any) -> tuple[Array, ...]:
             key = _key(light, viewer, *place) if self.is_random else None
             if numbers:
-                values = evaluate(self.with_numbers(numbers), _rows(light), _rows(viewer), self.transport, key=key)
+                values = evaluate(self.replace_numbers(numbers), _rows(light), _rows(viewer), self.transport, key=key)
             else:
                 values = evaluate(self.prepared, _rows(light), _rows(viewer), key=key)
-            return self._by_colour(values)
+            return self._split_colours(values)
 
         places = [place] if self.is_random and dr.width(place) else []
-        return mi.Spectrum(*_called(values_of, self._varying(), light, viewer, *places))
+        return mi.Spectrum(*_call_in_batches(values_of, self._differentiable(), light, viewer, *places))
 
-    def passing(self, wi: Any) -> Any:
+    def null_transmission(self, wi: Any) -> Any:
         """Share of the light that passes without being scattered, a spectrum."""
 
         def shares_of(numbers: Any, wi: Any) -> tuple[Array, ...]:
-            return self._by_colour(unscattered(self.with_numbers(numbers), _rows(wi)))
+            return self._split_colours(unscattered(self.replace_numbers(numbers), _rows(wi)))
 
-        return mi.Spectrum(*_called(shares_of, self._varying(), wi))
+        return mi.Spectrum(*_call_in_batches(shares_of, self._differentiable(), wi))
 
     def density(self, wi: Any, wo: Any) -> Any:
         """Density of `draw`, in 1/sr, without derivatives."""
@@ -135,7 +135,7 @@ class Material:
         def densities_of(_: Any, wi: Any, wo: Any) -> tuple[Array, ...]:
             return (pdf(self.prepared, _rows(wi), _rows(wo)),)
 
-        return _called(densities_of, {}, dr.detach(wi), dr.detach(wo))[0]
+        return _call_in_batches(densities_of, {}, dr.detach(wi), dr.detach(wo))[0]
 
     def draw(self, wi: Any, uniform: Any) -> tuple[Any, Any]:
         """Directions and their densities, without derivatives; uniform: numbers that the key is made of."""
@@ -144,14 +144,14 @@ class Material:
             wo, density, _ = sample(self.prepared, _rows(wi), _key(wi, uniform))
             return (*wo.T, density)
 
-        *wo, density = _called(draws_of, {}, dr.detach(wi), dr.detach(uniform))
+        *wo, density = _call_in_batches(draws_of, {}, dr.detach(wi), dr.detach(uniform))
         return mi.Vector3f(*wo), density
 
-    def _varying(self) -> dict[str, Any]:
+    def _differentiable(self) -> dict[str, Any]:
         """The numbers that gradients are enabled for."""
         return {name: number for name, number in self.numbers.items() if dr.grad_enabled(number)}
 
-    def _by_colour(self, values: Array) -> tuple[Array, ...]:
+    def _split_colours(self, values: Array) -> tuple[Array, ...]:
         return tuple(jnp.broadcast_to(values, (*values.shape[:-1], self.colours)).T)
 
 
@@ -160,9 +160,9 @@ def _plugin(variant: str) -> type:
     """The class for this variant, which is that which is set."""
 
     class Layered(mi.BSDF):
-        def __init__(self, properties: Any, material: Material | None = None):
+        def __init__(self, properties: Any, material: PluginMaterial | None = None):
             mi.BSDF.__init__(self, properties)
-            self.material = _material_of(properties) if material is None else material
+            self.material = _scene_material(properties) if material is None else material
             self._name_components()
 
         def _name_components(self) -> None:
@@ -187,13 +187,13 @@ def _plugin(variant: str) -> type:
             return _evaluate(self.material, ctx, si, wo, active)
 
         def pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
-            return _both(self.material, ctx, si, wo, active)[1]
+            return _evaluate_with_pdf(self.material, ctx, si, wo, active)[1]
 
         def eval_pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> tuple[Any, Any]:
-            return _both(self.material, ctx, si, wo, active)
+            return _evaluate_with_pdf(self.material, ctx, si, wo, active)
 
         def eval_null_transmission(self, si: Any, active: Any = True) -> Any:
-            share = self.material.passing(si.wi) if self.material.has_null else mi.Spectrum(0.0)
+            share = self.material.null_transmission(si.wi) if self.material.has_null else mi.Spectrum(0.0)
             return dr.select(active, share, 0.0)
 
         def to_string(self) -> str:
@@ -202,33 +202,33 @@ def _plugin(variant: str) -> type:
     return Layered
 
 
-def _material_of(properties: Any) -> Material:
+def _scene_material(properties: Any) -> PluginMaterial:
     """The material that a scene names."""
     name = properties.get("material", "")
     if name not in (*materials, *gallery.names()):
         known = ", ".join((*materials, *gallery.names()))
         raise ValueError(f"material: {name!r} is neither in layerjax.mitsuba.materials nor in the gallery: {known}")
-    return Material(*(materials[name] if name in materials else (gallery.stack(name), "auto")))
+    return PluginMaterial(*(materials[name] if name in materials else (gallery.stack(name), "auto")))
 
 
-def _evaluate(material: Material, ctx: Any, si: Any, wo: Any, active: Any) -> Any:
+def _evaluate(material: PluginMaterial, ctx: Any, si: Any, wo: Any, active: Any) -> Any:
     light, viewer = (wo, si.wi) if ctx.mode == mi.TransportMode.Radiance else (si.wi, wo)
     active = active & _is_enabled(material, ctx, si.wi, wo)
     value = material.value(light, viewer, si.p) * dr.abs(mi.Frame3f.cos_theta(wo))
     return dr.select(active, value, 0.0)
 
 
-def _both(material: Material, ctx: Any, si: Any, wo: Any, active: Any) -> tuple[Any, Any]:
+def _evaluate_with_pdf(material: PluginMaterial, ctx: Any, si: Any, wo: Any, active: Any) -> tuple[Any, Any]:
     """Value and density. Where light cannot go there is none of either: what is drawn there counts as not drawn."""
     value = _evaluate(material, ctx, si, wo, active)
-    density = material.density(si.wi, wo) * (1.0 - _share_of_null(material, ctx, si))
+    density = material.density(si.wi, wo) * (1.0 - _null_probability(material, ctx, si))
     active = active & _is_enabled(material, ctx, si.wi, wo) & (material.is_random | (dr.max(value) > 0.0))
     return value, dr.select(active, density, 0.0)
 
 
-def _sample(material: Material, ctx: Any, si: Any, sample1: Any, sample2: Any, active: Any) -> tuple[Any, Any]:
+def _sample(material: PluginMaterial, ctx: Any, si: Any, sample1: Any, sample2: Any, active: Any) -> tuple[Any, Any]:
     """Directions are drawn without derivatives, and the value over their density has those of the value."""
-    null = _share_of_null(material, ctx, si)
+    null = _null_probability(material, ctx, si)
     wo, density = material.draw(si.wi, mi.Vector3f(sample1, *sample2))
     density *= 1.0 - null
     value = dr.select(density > 0.0, _evaluate(material, ctx, si, wo, active) / density, 0.0)
@@ -246,28 +246,28 @@ def _sample(material: Material, ctx: Any, si: Any, sample1: Any, sample2: Any, a
         drawn.eta = dr.select(passes_through, 1.0, drawn.eta)
         drawn.sampled_type = dr.select(passes_through, +mi.BSDFFlags.Null, drawn.sampled_type)
         drawn.sampled_component = dr.select(passes_through, mi.UInt32(2), drawn.sampled_component)
-        value = dr.select(passes_through, material.passing(si.wi) / null, value)
+        value = dr.select(passes_through, material.null_transmission(si.wi) / null, value)
     drawn.pdf = dr.select(active, drawn.pdf, 0.0)
     return drawn, dr.select(active & (drawn.pdf > 0.0), value, 0.0)
 
 
-def _is_enabled(material: Material, ctx: Any, wi: Any, wo: Any) -> Any:
+def _is_enabled(material: PluginMaterial, ctx: Any, wi: Any, wo: Any) -> Any:
     """Whether a context enables the component that scatters light from wi to wo."""
     reflects = ctx.is_enabled(mi.BSDFFlags.GlossyReflection, 0)
     passes = material.is_open and ctx.is_enabled(mi.BSDFFlags.GlossyTransmission, 1)
     return dr.select(wi.z * wo.z > 0.0, mi.Bool(reflects), mi.Bool(passes))
 
 
-def _share_of_null(material: Material, ctx: Any, si: Any) -> Any:
+def _null_probability(material: PluginMaterial, ctx: Any, si: Any) -> Any:
     """Share of samples that pass through without scattering."""
     if not (material.has_null and ctx.is_enabled(mi.BSDFFlags.Null, 2)):
         return mi.Float(0.0)
     if not (ctx.is_enabled(mi.BSDFFlags.GlossyReflection, 0) or ctx.is_enabled(mi.BSDFFlags.GlossyTransmission, 1)):
         return mi.Float(1.0)
-    return dr.detach(dr.mean(material.passing(si.wi)))
+    return dr.detach(dr.mean(material.null_transmission(si.wi)))
 
 
-def _called(function: Callable[..., tuple[Array, ...]], numbers: dict[str, Any], *batches: Any) -> list[Any]:
+def _call_in_batches(function: Callable[..., tuple[Array, ...]], numbers: dict[str, Any], *batches: Any) -> list[Any]:
     """What a function of numbers and batches of vectors, lists of three arrays (N,), gives: arrays (N,)."""
     if dr.flag(dr.JitFlag.SymbolicScope):
         raise ValueError(

@@ -12,11 +12,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from layerjax._checks import in_short, require_key
-from layerjax._drawn import below_each_other
-from layerjax._parameters import RANGES, Parameter, check_range, floating, is_placeholder
+from layerjax._checks import abbreviate, require_key
+from layerjax._diagram import diagram_column
+from layerjax._parameters import RANGES, Parameter, as_floating, check_range, is_placeholder
+from layerjax._repr import ReprModule, format_value
 from layerjax._shapes import Shape, axes_of_map, channel_count, map_shape
-from layerjax._shown import Shown, in_words
 from layerjax.stack import Interface, Medium, Stack, TurbidMedium
 from layerjax.surfaces import Surface
 
@@ -28,10 +28,10 @@ SUM_SLACK = 1e-6
 """How far the sum of weights may be from 1: files round them."""
 
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]*")
-_TAKEN = ("weights", "parts", "layers", "base", "scale", "noise")
+_RESERVED = ("weights", "parts", "layers", "base", "scale", "noise")
 
 
-class Mixture(Shown):
+class Mixture(ReprModule):
     """Stacks side by side, each covering a share of the area; no light passes from one to another.
 
     A mixture can be used wherever a `Stack` can. Its BSDF, albedo and ballistic transmission are the weighted means of
@@ -52,16 +52,16 @@ class Mixture(Shown):
 
     def __init__(self, parts: Mapping[str, "Stack | Mixture"], weights: Sequence[Parameter] | Mapping[str, Parameter]):
         if not isinstance(parts, Mapping):
-            raise ValueError(f"{_PARTS}: {in_short(parts)} is not a dictionary of stacks by name")
+            raise ValueError(f"{_PARTS}: {abbreviate(parts)} is not a dictionary of stacks by name")
         if not isinstance(weights, Mapping | Sequence | np.ndarray | jax.Array) or isinstance(weights, str):
             raise ValueError(
-                f"{WEIGHTS}: {in_short(weights)} is not a list of shares, nor a dictionary of them by name"
+                f"{WEIGHTS}: {abbreviate(weights)} is not a list of shares, nor a dictionary of them by name"
             )
         for name in parts:
-            if not (isinstance(name, str) and _NAME.fullmatch(name)) or name in _TAKEN:
+            if not (isinstance(name, str) and _NAME.fullmatch(name)) or name in _RESERVED:
                 raise ValueError(
                     f"{_PARTS}: {name!r} is no name; it must be letters, digits, - and _, a letter first, and not "
-                    f"one of {', '.join(_TAKEN)}"
+                    f"one of {', '.join(_RESERVED)}"
                 )
         self.parts = dict(parts)
         self.weights = {name: _weight(name, value) for name, value in _by_name(parts, weights).items()}
@@ -69,7 +69,7 @@ class Mixture(Shown):
     def __check_init__(self) -> None:
         for name, part in self.parts.items():
             if not isinstance(part, Stack | Mixture):
-                raise ValueError(f"{_PARTS}[{name!r}]: {in_short(part)} is not a Stack or a Mixture")
+                raise ValueError(f"{_PARTS}[{name!r}]: {abbreviate(part)} is not a Stack or a Mixture")
         _check_sum(self.weights)
         channel_count(self)
 
@@ -83,19 +83,19 @@ class Mixture(Shown):
         shown = [
             part._repr_html_() if hasattr(part, "_repr_html_") else escape(repr(part)) for part in self.parts.values()
         ]
-        return below_each_other(list(zip(heads, shown, strict=True)))
+        return diagram_column(list(zip(heads, shown, strict=True)))
 
     def shares(self) -> dict[str, Array]:
         """Weights by name, that which is None worked out."""
         rest = 1.0 - sum(weight for weight in self.weights.values() if weight is not None)
         return {name: jnp.asarray(rest if weight is None else weight) for name, weight in self.weights.items()}
 
-    def each(self, function: Callable[[Any], Any]) -> "Mixture":
+    def map_parts(self, function: Callable[[Any], Any]) -> "Mixture":
         """The same mixture of function(part) for every part."""
         found = {name: function(part) for name, part in self.parts.items()}
         return eqx.tree_at(lambda mixture: mixture.parts, self, found)
 
-    def weighed(self, function: Callable[[Any, Any], Any], key: Array | None = None) -> list[tuple[Array, Any]]:
+    def weighted_values(self, function: Callable[[Any, Any], Any], key: Array | None = None) -> list[tuple[Array, Any]]:
         """The weight of every part, and function(part, its own key) of it; without a key each has None.
 
         By name, as they are within transformations: there, too, a key is that of the same part.
@@ -113,12 +113,14 @@ class Mixture(Shown):
             share = share.astype(value.dtype)
             return (share[..., None] if by_channel else share) * value
 
-        found = [jax.tree.map(partial(times, share), value) for share, value in self.weighed(function, key)]
+        found = [jax.tree.map(partial(times, share), value) for share, value in self.weighted_values(function, key)]
         return jax.tree.map(lambda *values: sum(values[1:], values[0]), *found)
 
-    def over(self, shape: Shape) -> "Mixture":
+    def broadcast_parts(self, shape: Shape) -> "Mixture":
         """The same with parts that are maps of exactly this shape, or single stacks."""
-        return self.each(lambda part: part.over(shape) if isinstance(part, Mixture) else _over(part, shape))
+        return self.map_parts(
+            lambda part: part.broadcast_parts(shape) if isinstance(part, Mixture) else _broadcast_part(part, shape)
+        )
 
 
 def require_material(stack: object, *others: type) -> None:
@@ -131,7 +133,7 @@ def require_material(stack: object, *others: type) -> None:
         hint = "; a surface alone is Stack([], base=surface)"
     elif isinstance(stack, Interface | Medium | TurbidMedium):
         hint = "; a layer alone is Stack([layer])"
-    raise ValueError(f"stack: {in_short(stack)} is not a {kinds}{hint}")
+    raise ValueError(f"stack: {abbreviate(stack)} is not a {kinds}{hint}")
 
 
 def stacks_of(material: Stack | Mixture) -> list[Stack]:
@@ -161,13 +163,13 @@ def _by_name(parts: Mapping[str, Any], weights: Any) -> dict[str, Any]:
 
 
 def _share_words(weight: Any) -> str:
-    return "the rest of the area" if weight is None else f"{in_words(weight, 4)} of the area"
+    return "the rest of the area" if weight is None else f"{format_value(weight, 4)} of the area"
 
 
 def _weight(name: str, value: Any) -> Any:
     if value is None or is_placeholder(value):
         return value
-    array = floating(f"{WEIGHTS}[{name!r}]", value)
+    array = as_floating(f"{WEIGHTS}[{name!r}]", value)
     try:
         check_range(WEIGHTS, array)
     except ValueError as error:
@@ -193,7 +195,7 @@ def _check_sum(weights: Mapping[str, Any]) -> None:
         raise ValueError(f"{WEIGHTS} sum to {float(totals[wrong].ravel()[0]):g}; they must sum to {must}")
 
 
-def _over(part: Any, shape: Shape) -> Any:
+def _broadcast_part(part: Any, shape: Shape) -> Any:
     """A map with its numbers broadcast to this shape; a single stack, or one that is prepared, as it is."""
     if not isinstance(part, Stack) or map_shape(part) in ((), shape):
         return part

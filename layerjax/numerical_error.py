@@ -2,7 +2,7 @@
 
 The difference of two resolutions changes its sign from direction to direction, and where it does it says nothing. So
 neighbouring pairs of directions are looked at as well, and none counts as more exact, relative to its value, than they
-are. Values that are cut off at 0 agree at any resolution: what was cut off counts (`Transport.doubt`).
+are. Values that are cut off at 0 agree at any resolution: what was cut off counts (`Transport.common_error`).
 """
 
 from collections.abc import Sequence
@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from layerjax._devices import compiled
+from layerjax._devices import compile_for_devices
 from layerjax._numerics import safe_div
 from layerjax.directions import angles, direction
 from layerjax.preparation import Prepared
@@ -30,12 +30,12 @@ def neighbours(wi: Array, wo: Array) -> tuple[Array, Array]:
     (theta_i, phi_i), (theta_o, phi_o) = angles(wi), angles(wo)
     found = [(wi, wo)]
     for step_i, step_o, turn in STEPS[1:]:
-        found.append((direction(_moved(theta_i, step_i), phi_i), direction(_moved(theta_o, step_o), phi_o + turn)))
+        found.append((direction(_shift(theta_i, step_i), phi_i), direction(_shift(theta_o, step_o), phi_o + turn)))
     first, second = zip(*found, strict=True)
     return jnp.stack(first).astype(wi.dtype), jnp.stack(second).astype(wi.dtype)
 
 
-def _moved(theta: Array, step: float) -> Array:
+def _shift(theta: Array, step: float) -> Array:
     """A polar angle moved towards or away from its pole, back from the tangent plane where it would cross it."""
     below = theta > 0.5 * jnp.pi
     polar = jnp.where(below, jnp.pi - theta, theta)
@@ -44,7 +44,7 @@ def _moved(theta: Array, step: float) -> Array:
     return jnp.where(below, jnp.pi - moved, moved)
 
 
-@compiled
+@compile_for_devices
 def numerical_error(
     prepared: Prepared, others: Sequence[Prepared], wi: Array, wo: Array, side: Side
 ) -> tuple[Array, Array]:
@@ -62,4 +62,4 @@ def numerical_error(
 def _values(prepared: Prepared, wi: Array, wo: Array, side: Side) -> tuple[Array, Array | float]:
     """Values, and the error of them in which resolutions may agree."""
     arguments = prepared.state, wi, wo, side, prepared.channels
-    return prepared.transport.measured(*arguments, None)[0], prepared.transport.doubt(*arguments)
+    return prepared.transport.evaluate_batch(*arguments, None)[0], prepared.transport.common_error(*arguments)

@@ -10,9 +10,9 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 
 from layerjax import transport as transports
-from layerjax._checks import in_short
-from layerjax._numerics import broadcasting
-from layerjax._parameters import in_precision
+from layerjax._checks import abbreviate
+from layerjax._numerics import allow_broadcasting
+from layerjax._parameters import cast_arrays
 from layerjax._shapes import channel_count, require_single
 from layerjax.directions import read_directions
 from layerjax.mixture import Mixture, require_material, stacks_of
@@ -20,7 +20,7 @@ from layerjax.stack import Stack, require_numbers, simplify_and_name
 from layerjax.transport import Transport
 from layerjax.transport.adding_doubling import AddingDoubling
 from layerjax.transport.automatic import automatic
-from layerjax.transport.known_directions import Known, KnownDirections, known_directions
+from layerjax.transport.known_directions import DirectionLookup, KnownDirections, known_directions
 
 
 class Prepared(eqx.Module):
@@ -35,7 +35,7 @@ class Prepared(eqx.Module):
 def prepare(stack: Stack, transport: Transport | Literal["auto"] = "auto") -> Prepared: ...
 @overload
 def prepare(stack: Mixture, transport: Transport | Literal["auto"] = "auto") -> Mixture: ...
-@broadcasting
+@allow_broadcasting
 def prepare(stack: Stack | Mixture, transport: Transport | Literal["auto"] = "auto") -> Prepared | Mixture:
     """Precompute everything that does not depend on direction.
 
@@ -49,8 +49,8 @@ def prepare(stack: Stack | Mixture, transport: Transport | Literal["auto"] = "au
     """
     require_material(stack)
     if isinstance(stack, Mixture):
-        return stack.each(lambda part: part if isinstance(part, Prepared) else prepare(part, transport))
-    return prepare_at(stack, transport, lambda: None)
+        return stack.map_parts(lambda part: part if isinstance(part, Prepared) else prepare(part, transport))
+    return prepare_for_directions(stack, transport, lambda: None)
 
 
 def choose_transport(
@@ -83,51 +83,55 @@ def choose_transport(
     return transport_for(stack, transport, known_directions(*read_directions(wi=wi, wo=wo)))
 
 
-@broadcasting
+@allow_broadcasting
 def transport_for(stack: Stack | Mixture, transport: Any, known: KnownDirections | None) -> Transport:
     """`choose_transport` for directions of which this is known; None: they are many, or not known."""
     require_material(stack)
-    found = [chosen_for(part, transport, lambda: known)[0] for part in stacks_of(stack)]
+    found = [resolve_transport(part, transport, lambda: known)[0] for part in stacks_of(stack)]
     solvers = [one for one in found if isinstance(one, AddingDoubling)]
     return _finest(solvers) if solvers else found[0]
 
 
-def prepared_at(stack: Stack | Prepared, transport: Any, dtype: jnp.dtype, known: Known = lambda: None) -> Prepared:
+def ensure_prepared(
+    stack: Stack | Prepared, transport: Any, dtype: jnp.dtype, known: DirectionLookup = lambda: None
+) -> Prepared:
     """A stack, prepared or not, for directions of this floating type, of which this is known."""
-    prepared = stack if isinstance(stack, Prepared) else prepare_at(stack, transport, known)
-    return in_precision(prepared, dtype)
+    prepared = stack if isinstance(stack, Prepared) else prepare_for_directions(stack, transport, known)
+    return cast_arrays(prepared, dtype)
 
 
-def prepared_for_energies(stack: Stack | Prepared, transport: Any, dtype: jnp.dtype) -> Prepared:
+def ensure_prepared_for_albedo(stack: Stack | Prepared, transport: Any, dtype: jnp.dtype) -> Prepared:
     """A stack, prepared or not, for its albedo along directions of this floating type."""
     if not isinstance(stack, Prepared):
         require_single(stack, "prepare")
-        chosen, simplified = chosen_for(stack, transport, None)
-        stack = Prepared(chosen.prepare_energies(simplified), chosen, channel_count(stack))
-    return in_precision(stack, dtype)
+        chosen, simplified = resolve_transport(stack, transport, None)
+        stack = Prepared(chosen.prepare_for_albedo(simplified), chosen, channel_count(stack))
+    return cast_arrays(stack, dtype)
 
 
-def prepare_at(stack: Stack, transport: Any, known: Known) -> Prepared:
+def prepare_for_directions(stack: Stack, transport: Any, known: DirectionLookup) -> Prepared:
     """`prepare` for values at directions of which this is known."""
     known = cache(known)
     require_single(stack, "prepare")
-    chosen, simplified = chosen_for(stack, transport, known)
-    return Prepared(chosen.prepare_for(simplified, known), chosen, channel_count(stack))
+    chosen, simplified = resolve_transport(stack, transport, known)
+    return Prepared(chosen.prepare_for_directions(simplified, known), chosen, channel_count(stack))
 
 
-def chosen_for(stack: Stack, transport: Any, known: Known | None) -> tuple[Transport, Stack]:
+def resolve_transport(stack: Stack, transport: Any, known: DirectionLookup | None) -> tuple[Transport, Stack]:
     """The transport with nothing left open, and the simplified stack; known is None: for energies."""
     require_numbers(stack)
     simplified, names = simplify_and_name(stack)
     chosen = automatic(stack, simplified) if isinstance(transport, str) and transport == "auto" else transport
     if not isinstance(chosen, Transport):
-        raise ValueError(f'transport: {in_short(transport)} is not a Transport or "auto"{_meant(transport)}')
+        raise ValueError(f'transport: {abbreviate(transport)} is not a Transport or "auto"{_suggestion(transport)}')
     chosen.check(simplified, names)
-    chosen = chosen.chosen_for_energies(simplified) if known is None else chosen.chosen_for(simplified, known)
+    chosen = (
+        chosen.resolve_options_for_albedo(simplified) if known is None else chosen.resolve_options(simplified, known)
+    )
     return chosen, simplified
 
 
-def _meant(transport: object) -> str:
+def _suggestion(transport: object) -> str:
     """The call that makes the transport which a class or a word names."""
     named = getattr(transports, transport, None) if isinstance(transport, str) else transport
     return f"; {named.__name__}() is one" if isinstance(named, type) and issubclass(named, Transport) else ""

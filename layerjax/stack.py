@@ -12,12 +12,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from layerjax._checks import in_short
-from layerjax._drawn import Row, picture
+from layerjax._checks import abbreviate
+from layerjax._diagram import DiagramRow, diagram
 from layerjax._numerics import safe_div
 from layerjax._parameters import Parameter, is_placeholder, leaves_with_names, parameter
+from layerjax._repr import ReprModule, describe
 from layerjax._shapes import channel_count
-from layerjax._shown import Shown, described
 from layerjax.channels import Channels, per_channel
 from layerjax.directions import Vector
 from layerjax.normals.facets import Distribution, check_facets
@@ -28,7 +28,7 @@ LEAST_EXTINCTION = 1e-10
 """In 1/mm, stands for 0 where derivatives by the coefficients of a turbid medium may be needed."""
 
 
-class Interface(Shown):
+class Interface(ReprModule):
     """Rough dielectric interface of microfacets (Walter et al. 2007).
 
     With Fresnel term F, distribution of normals D and masking G = G1(wi) G1(wo), reflection and transmission are::
@@ -62,7 +62,7 @@ class Interface(Shown):
         check_facets("Interface", self.distribution, self.alpha)
 
 
-class Medium(Shown):
+class Medium(ReprModule):
     """Plane-parallel medium that absorbs and scatters.
 
     Light along w is attenuated by exp(-thickness sigma(w) / cos); a collision scatters it by albedo schlick(f0)
@@ -90,7 +90,7 @@ class Medium(Shown):
         _check_phase("Medium", self.phase)
 
 
-class TurbidMedium(Shown):
+class TurbidMedium(ReprModule):
     """A `Medium` that is specified by its thickness and coefficients, as tissue and pigments are measured.
 
     Its optical depth is (mu_s + mu_a) d, at most 1e4, and its albedo mu_s / (mu_s + mu_a).
@@ -131,11 +131,11 @@ class TurbidMedium(Shown):
 def _check_phase(owner: str, phase: Any) -> None:
     if not isinstance(phase, PhaseFunction):
         raise ValueError(
-            f"{owner}.phase: {in_short(phase)} is not a HenyeyGreenstein, an SGGX or another PhaseFunction"
+            f"{owner}.phase: {abbreviate(phase)} is not a HenyeyGreenstein, an SGGX or another PhaseFunction"
         )
 
 
-class Stack(Shown):
+class Stack(ReprModule):
     """Layers from top to bottom over a base.
 
     Parameters of shape ``(N,)`` or ``(H, W)`` make it a map of stacks, one for each texel (see the guide on maps).
@@ -155,7 +155,7 @@ class Stack(Shown):
 
     def __init__(self, layers: Iterable[Interface | Medium | TurbidMedium], base: Surface | None = None):
         if not isinstance(layers, Iterable) or isinstance(layers, str | Mapping):
-            raise ValueError(f"Stack.layers: {in_short(layers)} is not a list of Interface, Medium and TurbidMedium")
+            raise ValueError(f"Stack.layers: {abbreviate(layers)} is not a list of Interface, Medium and TurbidMedium")
         self.layers = cast(tuple[Interface | Medium, ...], tuple(layers))
         self.base = base
 
@@ -163,10 +163,10 @@ class Stack(Shown):
         for index, layer in enumerate(self.layers):
             if not isinstance(layer, Interface | Medium | TurbidMedium):
                 raise ValueError(
-                    f"Stack.layers[{index}]: {in_short(layer)} is not an Interface, a Medium or a TurbidMedium"
+                    f"Stack.layers[{index}]: {abbreviate(layer)} is not an Interface, a Medium or a TurbidMedium"
                 )
         if self.base is not None and not isinstance(self.base, Surface):
-            raise ValueError(f"Stack.base: {in_short(self.base)} is not a surface or None")
+            raise ValueError(f"Stack.base: {abbreviate(self.base)} is not a surface or None")
         channel_count(self)
 
     @property
@@ -176,12 +176,12 @@ class Stack(Shown):
 
     def _repr_html_(self) -> str:
         rows = [
-            Row("interface" if isinstance(layer, Interface) else "medium", type(layer).__name__, described(layer))
+            DiagramRow("interface" if isinstance(layer, Interface) else "medium", type(layer).__name__, describe(layer))
             for layer in self.layers
         ]
         last = "no base: light passes" if self.base is None else type(self.base).__name__
-        rows.append(Row("nothing" if self.base is None else "base", last, described(self.base)))
-        return picture(rows, f"A stack, from top to bottom: {', '.join(row.name for row in rows)}")
+        rows.append(DiagramRow("nothing" if self.base is None else "base", last, describe(self.base)))
+        return diagram(rows, f"A stack, from top to bottom: {', '.join(row.name for row in rows)}")
 
 
 def require_numbers(stack: Any) -> None:
@@ -212,11 +212,11 @@ def simplify_and_name(stack: Stack) -> tuple[Stack, tuple[str, ...]]:
                 continue
             above = layer.ior
         if isinstance(layer, TurbidMedium):
-            layer = _turbid_with_known(layer).as_medium()
+            layer = _make_turbid_static(layer).as_medium()
         if isinstance(layer, Medium):
             if _is_everywhere(layer.thickness, 0.0):
                 continue
-            layer = eqx.tree_at(lambda medium: medium.phase, _with_known(layer), layer.phase.simplified())
+            layer = eqx.tree_at(lambda medium: medium.phase, _make_static(layer), layer.phase.simplify())
             if is_known(layer.f0, 1.0):
                 layer = eqx.tree_at(lambda medium: medium.f0, layer, None)
         layers.append(layer)
@@ -224,9 +224,9 @@ def simplify_and_name(stack: Stack) -> tuple[Stack, tuple[str, ...]]:
     return eqx.tree_at(lambda s: s.layers, stack, tuple(layers)), tuple(names)
 
 
-def with_known(stack: Stack) -> Stack:
+def make_constants_static(stack: Stack) -> Stack:
     """The same stack with albedos and f0 that are 0 or 1 for all channels as Python floats: known also under `jit`."""
-    layers = tuple(_layer_with_known(layer) for layer in stack.layers)
+    layers = tuple(_make_layer_static(layer) for layer in stack.layers)
     return eqx.tree_at(lambda s: s.layers, stack, layers)
 
 
@@ -249,23 +249,23 @@ def is_known(value: Any, number: float) -> bool:
     return isinstance(value, float) and value == number
 
 
-def _with_known(medium: Medium) -> Medium:
-    known = [_known(medium.albedo), None if medium.f0 is None else _known(medium.f0)]
+def _make_static(medium: Medium) -> Medium:
+    known = [_static_constant(medium.albedo), None if medium.f0 is None else _static_constant(medium.f0)]
     return eqx.tree_at(lambda m: (m.albedo, m.f0), medium, known, is_leaf=lambda leaf: leaf is None)
 
 
-def _layer_with_known(layer: Any) -> Any:
+def _make_layer_static(layer: Any) -> Any:
     if isinstance(layer, TurbidMedium):
-        return _turbid_with_known(layer)
-    return _with_known(layer) if isinstance(layer, Medium) else layer
+        return _make_turbid_static(layer)
+    return _make_static(layer) if isinstance(layer, Medium) else layer
 
 
-def _turbid_with_known(medium: TurbidMedium) -> TurbidMedium:
+def _make_turbid_static(medium: TurbidMedium) -> TurbidMedium:
     """Without scattering: known also while tracing."""
     return eqx.tree_at(lambda m: m.mu_s, medium, 0.0) if _is_everywhere(medium.mu_s, 0.0) else medium
 
 
-def _known(value: Any) -> Any:
+def _static_constant(value: Any) -> Any:
     return next((number for number in (0.0, 1.0) if _is_everywhere(value, number)), value)
 
 

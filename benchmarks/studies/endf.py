@@ -169,16 +169,16 @@ def _warping(paths: int) -> list[dict[str, Any]]:
         for number, (cosine, beam, facets) in enumerate(EXAMPLES, 1):
             c, o, m = (jnp.asarray(value) for value in (cosine, beam, facets))
             if kind == "reflection":
-                kappa, gains = warping.reflected(o, m, c), warping.reflection_gains(c)
+                kappa, gains = warping.reflect_beam(o, m, c), warping.reflection_gains(c)
                 exact = first = warping.reflected_moment(o, m, c)
             else:
-                kappa, gains = warping.refracted(o, m, c, ior), warping.refraction_gains(c, ior)
+                kappa, gains = warping.refract_beam(o, m, c, ior), warping.refraction_gains(c, ior)
                 length = jnp.asarray(endf_truth.warped(kind, cosine, beam, facets, 1.5, paths))
                 exact, first = concentration_of(length, 1.0 - length), warping.refraction_trace(o, m, c, ior)
             peak = endf_truth.peak(kind, cosine, beam, facets, 1.5)
             row: dict[str, Any] = {"exact": exact, "paper": kappa, "off": kappa / exact - 1.0, "first order": first}
             row |= {
-                "normals": warping.extended(kappa, gains),
+                "normals": warping.extended_concentration(kappa, gains),
                 "peak": peak,
                 "peak, paper": sphere_density(c * 0, kappa),
             }

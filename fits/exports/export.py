@@ -18,8 +18,8 @@ from fits.exports.openpbr import document as openpbr
 from fits.names import EXPORTS, To
 from fits.optimise.result import Fit
 from fits.progress import Progress, given_progress
-from layerjax._checks import in_short
-from layerjax.compiling import programs_kept
+from layerjax._checks import abbreviate
+from layerjax.compiling import program_cache
 
 _WRITERS: dict[str, Callable[[Material, Floats | None], Contents]] = {
     "rgl": rgl.contents,
@@ -56,7 +56,7 @@ class ExportReport:
     notes: tuple[str, ...]
 
 
-@programs_kept()
+@program_cache()
 def export(
     material: "lj.Stack | lj.Mixture | Fit",
     path: str | Path,
@@ -88,7 +88,7 @@ def export(
             that is not installed, or an existing file without `force`.
     """
     if not isinstance(to, str) or to not in EXPORTS:
-        raise ValueError(f"to is {in_short(to)}, must be one of {', '.join(EXPORTS)}")
+        raise ValueError(f"to is {abbreviate(to)}, must be one of {', '.join(EXPORTS)}")
     path = given_path("path", path)
     require_switch("force", force)
     if path.suffix.lower() != ENDINGS[to]:
@@ -109,7 +109,7 @@ def _stack_and_transport(material: Any, transport: Any) -> tuple[lj.Stack | lj.M
             raise ValueError("transport: the fit's is a function of one's own; give one of layerjax")
         return material.stack, transport or fitted
     if not isinstance(material, lj.Stack | lj.Mixture):
-        raise ValueError(f"material is {in_short(material)}, must be a Stack, a Mixture or a Fit")
+        raise ValueError(f"material is {abbreviate(material)}, must be a Stack, a Mixture or a Fit")
     return material, transport or "auto"
 
 

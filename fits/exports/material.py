@@ -79,7 +79,7 @@ class Material:
     def isotropic(self) -> bool:
         """Whether the BSDF is invariant to rotations about the normal."""
         media = [layer for part in self.parts for layer in part.layers if not isinstance(layer, lj.Interface)]
-        return all(medium.phase.is_upright for medium in media)
+        return all(medium.phase.is_axisymmetric for medium in media)
 
     @property
     def turns_by_half(self) -> bool:
@@ -88,7 +88,7 @@ class Material:
         Only flakes and fibers have a known axis.
         """
         media = [layer for part in self.parts for layer in part.layers if not isinstance(layer, lj.Interface)]
-        return all(medium.phase.is_upright or _lies_flat(medium.phase.flakes) for medium in media)
+        return all(medium.phase.is_axisymmetric or _lies_flat(medium.phase.flakes) for medium in media)
 
 
 def material_of(
@@ -117,7 +117,7 @@ def _widths(stack: lj.Stack) -> Iterator[float]:
     for layer in stack.layers:
         if isinstance(layer, lj.Interface):
             yield _number(layer.alpha)
-        elif layer.phase.flakes is not None and layer.phase.flakes.kind == "surface" and layer.phase.is_upright:
+        elif layer.phase.flakes is not None and layer.phase.flakes.kind == "surface" and layer.phase.is_axisymmetric:
             yield _number(layer.phase.flakes.alpha)
     if isinstance(stack.base, lj.Conductor):
         yield _number(stack.base.alpha)

@@ -32,7 +32,7 @@ from fits.problem.parameters import at_start, is_free
 from fits.problem.problem import with_floor
 from fits.store import fingerprint, portable_repr
 from layerjax._checks import require_kind
-from layerjax.compiling import programs_kept
+from layerjax.compiling import program_cache
 
 if TYPE_CHECKING:
     from fits.data.geometry import Geometry
@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 NAMED = 8  # chunks that an error names of those that could not be done
 
 
-@programs_kept()
+@program_cache()
 def fit_map(
     stack: Any,
     geometry: "Geometry | Any",

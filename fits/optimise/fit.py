@@ -42,13 +42,13 @@ from fits.problem.parameters import Free
 from fits.problem.problem import FittingProblem, Problem
 from fits.progress import Progress, given_progress, named, silent
 from layerjax._checks import require_count, require_kind, require_seed
-from layerjax.compiling import programs_kept
+from layerjax.compiling import program_cache
 
 SAME_AT_MOST = 0.05  # share of its box up to which a standard error counts where minima are compared
 MOST_STARTS = 8  # minima without model discrepancy that the fit with it starts from; of other starts half as many
 
 
-@programs_kept()
+@program_cache()
 def fit(
     stack: Any,
     data: Measurements | None = None,

@@ -17,7 +17,7 @@ from fits.prediction.predict import DRAWS, Prediction, predict
 from fits.progress import Progress
 from fits.sampling.posterior import Posterior
 from layerjax._checks import require_kind
-from layerjax.compiling import programs_kept
+from layerjax.compiling import program_cache
 
 LINEAR = 1e6  # softness that makes the logarithm linear, in units of the largest value: asinh(x / s) is x / s there
 
@@ -71,7 +71,7 @@ def fits_of(candidates: Mapping[str, Fit | Posterior]) -> dict[str, Fit]:
     return {name: one.fit if isinstance(one, Posterior) else one for name, one in candidates.items()}
 
 
-@programs_kept()
+@program_cache()
 def compare(
     candidates: Mapping[str, Fit | Posterior],
     *,
@@ -210,7 +210,7 @@ class Average:
         )
 
 
-@programs_kept()
+@program_cache()
 def average(
     candidates: Mapping[str, Fit | Posterior],
     weights: Mapping[str, float] | None = None,

@@ -26,7 +26,7 @@ from fits.progress import Progress, given_progress, named
 from fits.sampling.initial import other_minima
 from fits.sampling.mixture import Mixture
 from layerjax._checks import require_count, require_kind, require_seed
-from layerjax.compiling import programs_kept
+from layerjax.compiling import program_cache
 
 DRAWS = 128  # draws of the posterior that held-out data are predicted with at a time, see `ComparisonOptions`
 INFINITE_NOISE = 1e8  # noise with which a measurement does not influence a fit, in units of the largest measurement
@@ -65,7 +65,7 @@ class CrossValidation:
         return float(np.linalg.norm(self.errors))
 
 
-@programs_kept()
+@program_cache()
 def cross_validate(
     fit: Fit,
     *,

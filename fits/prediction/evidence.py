@@ -9,7 +9,7 @@ from fits.optimise.result import Fit
 from fits.prediction.options import DEFAULT
 from fits.sampling.importance import ImportanceDraws, importance_draws
 from layerjax._checks import require_count, require_kind, require_seed
-from layerjax._numerics import broadcasting
+from layerjax._numerics import allow_broadcasting
 
 DRAWS = 1000  # before more are added where weights are uneven
 
@@ -34,7 +34,7 @@ class Evidence:
         return self.pareto_k < DEFAULT.max_pareto_k
 
 
-@broadcasting
+@allow_broadcasting
 def evidence(fit: Fit, *, draws: int = DRAWS, seed: int = 0) -> Evidence:
     """The marginal likelihood of a fitted stack, under the priors of its parameters within their bounds.
 

@@ -34,8 +34,8 @@ from fits.sampling.initial import normal_draws
 from fits.sampling.mixture import Mixture
 from fits.sampling.options import MAX_PARETO_K
 from fits.sampling.posterior import Posterior
-from layerjax._checks import in_short, require_count, require_kind, require_number, require_seed
-from layerjax.compiling import programs_kept
+from layerjax._checks import abbreviate, require_count, require_kind, require_number, require_seed
+from layerjax.compiling import program_cache
 
 # quantiles of a `Summary`: the ends of the central 50 % and 95 % intervals, and the median
 LEVELS = (0.025, 0.25, 0.5, 0.75, 0.975)
@@ -255,7 +255,7 @@ class Predictor(Protocol):
     def predict(self, at: Geometry | Measurements, *, draws: int, seed: int) -> Prediction: ...
 
 
-@programs_kept()
+@program_cache()
 def predict(
     fitted: Fit | Posterior | Predictor, at: Geometry | Measurements, *, draws: int = DRAWS, seed: int = 0
 ) -> Prediction:
@@ -280,7 +280,7 @@ def predict(
     require_kind("at", at, Geometry, Measurements, fix=TO_HAVE_THEM)
     if not isinstance(fitted, Fit | Posterior):
         if isinstance(fitted, type) or not hasattr(fitted, "predict"):
-            raise ValueError(f"fitted: {in_short(fitted)} is not a Fit, a Posterior or an Average")
+            raise ValueError(f"fitted: {abbreviate(fitted)} is not a Fit, a Posterior or an Average")
         return fitted.predict(at, draws=draws, seed=seed)
     return posterior_predictive(fitted, at, draws=draws, seed=seed)
 

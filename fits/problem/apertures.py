@@ -79,7 +79,7 @@ def _narrowest(material: lj.Stack | lj.Mixture) -> tuple[float, float]:
             elif isinstance(part, lj.Medium | lj.TurbidMedium):
                 for end in (1, 2):  # at the lower bounds of what is free, and at the upper
                     phase = at_start(part.phase, end)
-                    upright = isinstance(phase, lj.SGGX) and phase.kind == "surface" and phase.is_upright
+                    upright = isinstance(phase, lj.SGGX) and phase.kind == "surface" and phase.is_axisymmetric
                     (facets if upright else others).append(float(np.min(phase.width)))
     return min(facets), min(others)
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import OpenBLASController, ThreadpoolController
 
-from layerjax._numerics import broadcasting
+from layerjax._numerics import allow_broadcasting
 from layerjax.compiling import compiler_options, is_outermost
 
 T = TypeVar("T")
@@ -39,7 +39,7 @@ class Static:
         return isinstance(other, Static) and self.key == other.key
 
 
-@broadcasting
+@allow_broadcasting
 def run(function: Callable[..., Any], split_model: tuple[Any, Static], *arguments: Any) -> Any:
     """`function(model, *arguments)` compiled, and done; see `Problem.call`."""
     with one_thread():
@@ -129,7 +129,7 @@ def _threads() -> ThreadPoolExecutor:
 
 def on_all_cores(call: Callable[[T], U], items: Iterable[T]) -> list[U]:
     """What `call` gives of each, whose programs are compiled."""
-    return list(_threads().map(broadcasting(call), items))
+    return list(_threads().map(allow_broadcasting(call), items))
 
 
 def as_finished(call: Callable[[T], U], items: Iterable[T], threads: int | None = None) -> Iterator[tuple[int, U]]:
@@ -145,7 +145,7 @@ def as_finished(call: Callable[[T], U], items: Iterable[T], threads: int | None 
     try:  # each is begun when there is room for it: an interrupt need not wait for the others
         while True:
             for index, item in islice(pending, most - len(running)):
-                running[pool.submit(broadcasting(call), item)] = index
+                running[pool.submit(allow_broadcasting(call), item)] = index
             if not running:
                 return
             for future in wait(running, return_when=FIRST_COMPLETED).done:

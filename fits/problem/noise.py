@@ -25,7 +25,7 @@ from fits.data.measurements import LARGEST, Measurements
 from fits.names import Objective
 from fits.problem.discrepancy import Discrepancy, softness
 from fits.problem.parameters import Free, is_free, require_number_or_free
-from layerjax._checks import in_short, require_choice, require_number
+from layerjax._checks import abbreviate, require_choice, require_number
 
 Tails = Literal["gaussian", "student"]
 DEFAULT_RELATIVE = 0.05
@@ -74,7 +74,7 @@ class Noise:
         if self.discrepancy is True:
             object.__setattr__(self, "discrepancy", Discrepancy())
         if not (self.discrepancy in (False, None) or isinstance(self.discrepancy, Discrepancy)):
-            given = in_short(self.discrepancy)
+            given = abbreviate(self.discrepancy)
             raise ValueError(f"Noise.discrepancy is {given}; it must be true, false or Discrepancy")
         if self.discrepancy and self.tails != "gaussian":
             raise ValueError(f"Noise.tails is {self.tails!r}; with model discrepancy it must be gaussian")

@@ -21,8 +21,8 @@ from scipy import stats
 import layerjax as lj
 from fits._files import require_switch
 from fits.data.geometry import Floats
-from layerjax._checks import in_short, require_kind, require_number
-from layerjax._shown import Shown
+from layerjax._checks import abbreviate, require_kind, require_number
+from layerjax._repr import ReprModule
 from layerjax.mixture import stacks_by_name
 
 SMALLEST = float(np.finfo(float).tiny)  # what is smaller is 0 in compiled programs
@@ -89,14 +89,14 @@ def _require_computable(prior: Prior, low: Floats, high: Floats) -> None:
     """ValueError for bounds, each () or (C,), and a prior whose density within them float64 cannot hold."""
     if prior.logarithmic and np.any(low < SMALLEST):
         words = f"must be above 0 for the prior {prior}, at least {SMALLEST:.2g}"
-        raise ValueError(f"Free.low is {in_short(low.tolist())}; it {words}")
+        raise ValueError(f"Free.low is {abbreviate(low.tolist())}; it {words}")
     centre, inverse_sd = prior.gaussian()
     with np.errstate(all="ignore"):
         ends = np.log([low, high]) if prior.logarithmic else np.array([low, high])
         squares = np.square((ends - centre) * inverse_sd)
         normalisers = [_log_normaliser(prior, *pair) for pair in zip(low.ravel(), high.ravel(), strict=True)]
     if not (np.all(np.isfinite(squares)) and np.all(np.isfinite(normalisers))):
-        bounds = f"[{in_short(low.tolist())}, {in_short(high.tolist())}]"
+        bounds = f"[{abbreviate(low.tolist())}, {abbreviate(high.tolist())}]"
         raise ValueError(f"Free.prior is {prior}; float64 cannot hold its density between the bounds {bounds}")
 
 
@@ -171,17 +171,17 @@ class Free:
             if (value := getattr(self, field)) is not None or field != "random_walk_sd":
                 object.__setattr__(self, field, _plain(f"Free.{field}", value))
         first, lower, upper = self.arrays()
-        low, high = in_short(self.low), in_short(self.high)
+        low, high = abbreviate(self.low), abbreviate(self.high)
         if np.any(lower >= upper):
             raise ValueError(f"Free.low is {low} and Free.high is {high}; low must be below high")
         if np.any((first < lower) | (first > upper)):
-            raise ValueError(f"Free.start is {in_short(self.start)}; it must lie in [{low}, {high}]")
+            raise ValueError(f"Free.start is {abbreviate(self.start)}; it must lie in [{low}, {high}]")
         _require_computable(self.prior, lower, upper)
         if self.random_walk_sd is not None:
             steps, count = np.asarray(self.random_walk_sd), math.prod(self.shape) - 1
             if not (count and steps.shape in ((), (count,)) and np.all(steps > 0.0)):
                 words = f"must be above 0, one number or one for each of the {count} steps between channels"
-                raise ValueError(f"Free.random_walk_sd is {in_short(self.random_walk_sd)}; it {words}")
+                raise ValueError(f"Free.random_walk_sd is {abbreviate(self.random_walk_sd)}; it {words}")
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -201,7 +201,7 @@ class Free:
         try:
             start, low, high = np.broadcast_arrays(*(np.asarray(one, float) for one in given))
         except ValueError:
-            raise ValueError(f"Free: {in_short(given)} have different numbers of channels") from None
+            raise ValueError(f"Free: {abbreviate(given)} have different numbers of channels") from None
         return start, low, high
 
 
@@ -211,7 +211,7 @@ def _plain(field: str, value: Any) -> float | tuple[float, ...]:
     except (TypeError, ValueError, OverflowError):
         array = np.zeros(0)
     if array.ndim > 1 or array.size == 0 or not np.isfinite(array).all():
-        raise ValueError(f"{field} is {in_short(value)}; it must be a finite number or one per channel")
+        raise ValueError(f"{field} is {abbreviate(value)}; it must be a finite number or one per channel")
     return float(array) if array.ndim == 0 else tuple(array.tolist())
 
 
@@ -231,7 +231,7 @@ def require_number_or_free(name: str, value: Any, low: float, high: float) -> No
     require_number(f"{name}.high", value.high, low, high)
 
 
-class PowerLaw(Shown):
+class PowerLaw(ReprModule):
     """A parameter per channel that follows a power law: ``amplitude (wavelength / reference)^-exponent``.
 
     Args:
@@ -262,7 +262,7 @@ class PowerLaw(Shown):
         for name, values in (("wavelengths", given), ("reference", 1.0 if reference is None else reference)):
             if not np.all(np.isfinite(values) & (np.asarray(values) > 0.0)):
                 raise ValueError(
-                    f"PowerLaw.{name} is {in_short(np.asarray(values).tolist())}; it must be finite and above 0"
+                    f"PowerLaw.{name} is {abbreviate(np.asarray(values).tolist())}; it must be finite and above 0"
                 )
         self.wavelengths = tuple(given.tolist())
         self.reference = float(np.exp(np.mean(np.log(given)))) if reference is None else float(reference)

@@ -34,11 +34,11 @@ from fits.problem.instrument import Instrument, optics_of, setting_of
 from fits.problem.model import JointModel, Linearisation, Model, Parts, Transport, linearise, predict_each
 from fits.problem.noise import Levels, Noise, is_assumed, noise_levels, require_size
 from fits.problem.parameters import Box, Free, LogNormal, Normal, is_free, names_of, require_in_range, split
-from layerjax._checks import in_short, require_choice, require_kind, require_number
+from layerjax._checks import abbreviate, require_choice, require_kind, require_number
 from layerjax._parameters import plain_name
 from layerjax._shapes import channel_count
 from layerjax.mixture import require_material
-from layerjax.stack import with_known
+from layerjax.stack import make_constants_static
 from layerjax.transport.known_directions import known_directions
 
 # of parameters by how their names end; all others are plain ratios
@@ -385,7 +385,7 @@ def _assemble(problem: Problem) -> Assembled:
     scale = 1.0 if problem.scale is None else problem.scale
     rest = (scale, setting, levels.relative, levels.floor, correlation)
     rest = jax.tree.map(lambda x: x if is_free(x) else jnp.asarray(x), rest, is_leaf=is_free)
-    template, free = split((_with_known(problem.stack), *rest), _parameter_name)
+    template, free = split((_make_static(problem.stack), *rest), _parameter_name)
     if not free:
         raise ValueError("stack: nothing is free; put fits.Free(start, low, high) where a number is to be fitted")
     _require_weights(problem.objective, levels, process, free)
@@ -426,7 +426,7 @@ def _require_kinds(problem: Problem) -> None:
     if isinstance(problem.transport, str | lj.Transport):
         require_material(problem.stack)
     elif not callable(problem.transport):  # a function takes any stack
-        raise ValueError(f'transport: {in_short(problem.transport)} is not a Transport or "auto", nor a function')
+        raise ValueError(f'transport: {abbreviate(problem.transport)} is not a Transport or "auto", nor a function')
     require_kind("data", problem.data, Measurements, fix=TO_HAVE_THEM)
     require_kind("noise", problem.noise, Noise)
     require_kind("instrument", problem.instrument, Instrument, None)
@@ -455,15 +455,15 @@ def _require_weights(objective: Objective, levels: Levels, process: Process | No
         raise ValueError(f"{weighed[0]}: objective {objective!r} weighs neither levels of noise nor priors; omit it")
 
 
-def _with_known(stack: Any) -> Any:
+def _make_static(stack: Any) -> Any:
     """What is 0 or 1 stays known where the rest is traced: it costs nothing, and some transports ask for it."""
     if not isinstance(stack, lj.Mixture):
-        return with_known(stack) if isinstance(stack, lj.Stack) else stack
+        return make_constants_static(stack) if isinstance(stack, lj.Stack) else stack
     given = [weight for weight in stack.weights.values() if weight is not None]
     most = sum(float(weight.arrays()[2] if is_free(weight) else weight) for weight in given)
     if any(map(is_free, given)) and most > 1.0:
         raise ValueError(f"Mixture.weights: at their upper bounds they sum to {most:g}; it must be at most 1")
-    return stack.each(_with_known)
+    return stack.map_parts(_make_static)
 
 
 def _parameter_name(path: str) -> str:
@@ -476,7 +476,7 @@ def _directions(problem: Problem, wi: Floats, wo: Floats, other_rays: bool = Fal
     """What a model holds of measurements along these directions, (N, 3) each; other_rays: see `optics_of`."""
     transport, optics = problem.transport, None
     # where known directions are of no use, programs should not depend on how many there are
-    follow = transport == "auto" or (isinstance(transport, lj.Transport) and transport.uses_known)
+    follow = transport == "auto" or (isinstance(transport, lj.Transport) and transport.uses_known_directions)
     follow = follow and not isinstance(problem.data, Totals)  # whose light leaves along all directions
     if problem.instrument is not None:
         incidences = polar_angles(problem.data)

@@ -9,11 +9,11 @@ from fits.data.geometry import Floats, Geometry, polar
 from fits.data.measurements import SMALLEST_SIGMA, Measurements, Source, channel_names
 from fits.problem.model import Transport, forward
 from layerjax._checks import require_kind, require_number, require_seed
-from layerjax.compiling import programs_kept
+from layerjax.compiling import program_cache
 from layerjax.mixture import stacks_of
 
 
-@programs_kept()
+@program_cache()
 def simulate(
     stack: lj.Stack | lj.Mixture,
     geometry: Geometry,

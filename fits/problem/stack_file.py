@@ -31,7 +31,7 @@ from fits.problem.instrument import Instrument
 from fits.problem.noise import LEVELS, Noise
 from fits.problem.parameters import Free, LogNormal, LogUniform, Normal, PowerLaw, Prior, Uniform
 from layerjax import gallery
-from layerjax._checks import in_short, require_kind, require_number
+from layerjax._checks import abbreviate, require_kind, require_number
 from layerjax._shapes import require_single
 from layerjax.mixture import require_material
 
@@ -267,14 +267,14 @@ def _require_bounds(where: str, free: Free, allowed: tuple[float, float]) -> Non
     low, high = allowed
     for name, one in zip(("start", "low", "high"), free.arrays(), strict=True):
         if np.any((one < low) | (one > high)):
-            raise ValueError(f"{where}.{name} is {in_short(one.tolist())}, must be a number in [{low:g}, {high:g}]")
+            raise ValueError(f"{where}.{name} is {abbreviate(one.tolist())}, must be a number in [{low:g}, {high:g}]")
 
 
 def choice(where: str, value: Any, allowed: Iterable[str]) -> str:
     """The value itself, if it is one of the allowed words; ValueError, with a likely one, for anything else."""
     allowed = tuple(allowed)
     if not (isinstance(value, str) and value in allowed):
-        given = f"{in_short(value)}{_suggestion(value, allowed)}"
+        given = f"{abbreviate(value)}{_suggestion(value, allowed)}"
         raise ValueError(f"{where} is {given}, must be one of {', '.join(allowed)}")
     return value
 
@@ -283,14 +283,14 @@ def check_keys(where: str, table: Mapping[str, Any], allowed: tuple[str, ...]) -
     """Raise a ValueError for a key of the table that is not among the allowed ones."""
     for key in table:
         if key not in allowed:
-            given = f"{in_short(key)}{_suggestion(key, allowed)}"
+            given = f"{abbreviate(key)}{_suggestion(key, allowed)}"
             raise ValueError(f"{where} has an unknown key {given}; allowed: {', '.join(allowed)}")
 
 
 def require_table(where: str, table: Any) -> dict[str, Any]:
     """The value itself, if it is a table; ValueError for anything else."""
     if not isinstance(table, dict):
-        raise ValueError(f"{where} is {in_short(table)}, must be a table")
+        raise ValueError(f"{where} is {abbreviate(table)}, must be a table")
     return table
 
 

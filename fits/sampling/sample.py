@@ -23,7 +23,7 @@ from fits.sampling.options import SamplerOptions
 from fits.sampling.posterior import Posterior, posterior_of
 from fits.store import Store, another, differences, fingerprint
 from layerjax._checks import require_kind, require_seed
-from layerjax.compiling import programs_kept
+from layerjax.compiling import program_cache
 
 WALKERS = 20  # of which 50 autocorrelation times have about 1,000 effective samples
 PATIENCE = 10.0  # seconds between two looks at a chain that grows slowly, for what progress shows
@@ -31,7 +31,7 @@ PATIENCE = 10.0  # seconds between two looks at a chain that grows slowly, for w
 Sampler = Literal["emcee", "nuts"]
 
 
-@programs_kept()
+@program_cache()
 def sample(
     fit: Fit,
     *,

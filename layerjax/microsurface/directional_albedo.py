@@ -4,7 +4,7 @@ Without multiple scattering between facets ("single") this is one event with sep
 2007), by quadrature over the visible facets. With it ("multiple") it is the walk on the microsurface of Heitz et al.
 2016 ("Multiple-scattering microfacet BSDFs with the Smith model"): its first event by quadrature, with height-
 correlated masking, and of what that leaves on the surface the share that returns, a smooth function fitted to walks
-(`layerjax.precompute.microsurface`). Of conductors there are the parts: `reflecting` facets, and `first_mirror` for
+(`layerjax.precompute.microsurface`). Of conductors there are the parts: the `reflection_region`, and `first_mirror` for
 `conductor_multiple_reflectance` to go on.
 
 Cosines are those of incidence, in (0, 1]; alpha is in [1e-4, 1]; all arguments broadcast. `points` is the number of
@@ -37,28 +37,28 @@ from jax import Array
 from jax.typing import ArrayLike
 
 from layerjax import fresnel
-from layerjax._numerics import at_least, at_most
+from layerjax._numerics import clamp_max, clamp_min
 from layerjax.microsurface.multiple_bounces import interface_multiple_reflectance
 from layerjax.microsurface.visible_facets import (
     Cap,
     Facets,
     cone,
-    everything,
-    facets_in,
-    facets_split,
     make_cap,
-    refracting,
+    refraction_region,
+    region_facets,
+    split_facets,
+    whole_region,
 )
 
 POINTS = 12
 
-SMOOTH = 1e-4
+SMOOTH_ALPHA = 1e-4
 """The least width. Of a surface known to be so narrow the energies are Fresnel's, and no quadrature is needed."""
 
 
 def is_smooth(alpha: Any) -> bool:
-    """Whether a width is known while tracing to be `SMOOTH`."""
-    return not isinstance(alpha, jax.core.Tracer) and bool(np.all(np.asarray(alpha) <= SMOOTH))
+    """Whether a width is known while tracing to be `SMOOTH_ALPHA`."""
+    return not isinstance(alpha, jax.core.Tracer) and bool(np.all(np.asarray(alpha) <= SMOOTH_ALPHA))
 
 
 @partial(jax.jit, static_argnames=("multiple", "points"))
@@ -75,7 +75,7 @@ def interface_energies(
     cosine, alpha, ior = _arrays(cosine, alpha, ior)
     if not multiple:
         cap = make_cap(cosine, alpha)
-        return _reflected(cap, ior, points), _passing(cap, ior, points)[1]
+        return _reflected_energy(cap, ior, points), _refracted_energies(cap, ior, points)[1]
     first, reflected_on, refracted_on = first_event(cosine, alpha, ior, points=points)
     returned = interface_multiple_reflectance(cosine, alpha, ior)
     reflected = _share(first + reflected_on * returned[0] + refracted_on * returned[1])
@@ -86,11 +86,11 @@ def interface_energies(
 def lobe_energy(cosine: ArrayLike, alpha: ArrayLike, *, points: int = POINTS) -> Array:
     """Reflectance of a rough surface of perfect mirrors, single scattering."""
     cosine, alpha = _arrays(cosine, alpha)
-    return _lobe(reflecting(make_cap(cosine, alpha), points))
+    return _lobe(reflection_region(make_cap(cosine, alpha), points))
 
 
 @partial(jax.jit, static_argnames="points")
-def retained(cosine: ArrayLike, alpha: ArrayLike, ratio: ArrayLike, *, points: int = POINTS) -> Array:
+def escape_cone_share(cosine: ArrayLike, alpha: ArrayLike, ratio: ArrayLike, *, points: int = POINTS) -> Array:
     """Share of the lobe of `lobe_energy` that lies in sin(theta_o) < ratio: what a smooth interface above lets pass.
 
     Args:
@@ -101,7 +101,7 @@ def retained(cosine: ArrayLike, alpha: ArrayLike, ratio: ArrayLike, *, points: i
     """
     cosine, alpha, ratio = _arrays(cosine, alpha, ratio)
     cap = make_cap(cosine, alpha)
-    share = _lobe(facets_in(cap, cone(cap, ratio), points)) / _lobe(reflecting(cap, points))
+    share = _lobe(region_facets(cap, cone(cap, ratio), points)) / _lobe(reflection_region(cap, points))
     return jnp.where(ratio < 1.0, _share(share), 1.0)
 
 
@@ -114,10 +114,10 @@ def first_event(
     """
     cosine, alpha, ior = _arrays(cosine, alpha, ior)
     cap = make_cap(cosine, alpha)
-    upper = facets_split(cap, cone(cap, jnp.ones_like(cosine)), refracting(cap, ior), points)
+    upper = split_facets(cap, cone(cap, jnp.ones_like(cosine)), refraction_region(cap, ior), points)
     first = upper.mean(fresnel.dielectric(upper.facing, ior[..., None, None]) * escape(upper))
-    crossing, transmitted = _passing(cap, ior, points)
-    return first, at_least(1.0 - crossing - first, 0.0), at_least(crossing - transmitted, 0.0)
+    crossing, transmitted = _refracted_energies(cap, ior, points)
+    return first, clamp_min(1.0 - crossing - first, 0.0), clamp_min(crossing - transmitted, 0.0)
 
 
 def first_mirror(
@@ -126,10 +126,10 @@ def first_mirror(
     """First event of the walk on a conductor: shares reflected away, and to other facets."""
     cosine, alpha, ior, k = _arrays(cosine, alpha, ior, k)
     cap = make_cap(cosine, alpha)
-    upper, seen = reflecting(cap, points), facets_in(cap, everything(cap), points)
+    upper, seen = reflection_region(cap, points), region_facets(cap, whole_region(cap), points)
     levels = [fresnel.conductor(part.facing, ior[..., None, None], k[..., None, None]) for part in (upper, seen)]
     first = upper.mean(levels[0] * escape(upper))
-    return first, at_least(seen.mean(levels[1]) - first, 0.0)
+    return first, clamp_min(seen.mean(levels[1]) - first, 0.0)
 
 
 def _arrays(*values: ArrayLike) -> list[Array]:
@@ -138,26 +138,28 @@ def _arrays(*values: ArrayLike) -> list[Array]:
     return jnp.broadcast_arrays(*(jnp.asarray(value, dtype) for value in values))
 
 
-def reflecting(cap: Cap, points: int) -> Facets:
+def reflection_region(cap: Cap, points: int) -> Facets:
     """Facets that reflect above the horizon."""
-    return facets_in(cap, cone(cap, jnp.ones_like(cap.cosine)), points)
+    return region_facets(cap, cone(cap, jnp.ones_like(cap.cosine)), points)
 
 
 def _lobe(facets: Facets) -> Array:
-    return facets.mean(masking(facets.reflected(), facets.alpha))
+    return facets.mean(masking(facets.reflected_cosine(), facets.alpha))
 
 
-def _reflected(cap: Cap, ior: Array, points: int) -> Array:
+def _reflected_energy(cap: Cap, ior: Array, points: int) -> Array:
     """Reflected by dielectric facets and not masked."""
-    upper = facets_split(cap, cone(cap, jnp.ones_like(cap.cosine)), refracting(cap, ior), points)
-    return upper.mean(fresnel.dielectric(upper.facing, ior[..., None, None]) * masking(upper.reflected(), upper.alpha))
+    upper = split_facets(cap, cone(cap, jnp.ones_like(cap.cosine)), refraction_region(cap, ior), points)
+    return upper.mean(
+        fresnel.dielectric(upper.facing, ior[..., None, None]) * masking(upper.reflected_cosine(), upper.alpha)
+    )
 
 
-def _passing(cap: Cap, ior: Array, points: int) -> tuple[Array, Array]:
+def _refracted_energies(cap: Cap, ior: Array, points: int) -> tuple[Array, Array]:
     """Refracted by dielectric facets: all, and what is not masked."""
-    passing, index = facets_in(cap, refracting(cap, ior), points), ior[..., None, None]
+    passing, index = region_facets(cap, refraction_region(cap, ior), points), ior[..., None, None]
     crossing = 1.0 - fresnel.dielectric(passing.facing, index)
-    return passing.mean(crossing), passing.mean(crossing * masking(passing.refracted(index), passing.alpha))
+    return passing.mean(crossing), passing.mean(crossing * masking(passing.refracted_cosine(index), passing.alpha))
 
 
 def _sigma(cosine: Array, alpha: Array) -> Array:
@@ -174,7 +176,7 @@ def masking(cosine: Array, alpha: Array) -> Array:
 
 def escape(facets: Facets) -> Array:
     """Share that leaves the surface of what facets reflect, given the heights at which wi meets them: G2 / G1(wi)."""
-    reflected = facets.reflected()
+    reflected = facets.reflected_cosine()
     above = reflected > 0
     z = jnp.where(above, reflected, 0.5)
     sigma_i, sigma_o = _sigma(facets.cosine, facets.alpha), _sigma(z, facets.alpha)
@@ -183,4 +185,4 @@ def escape(facets: Facets) -> Array:
 
 def _share(x: Array) -> Array:
     """x, kept in [0, 1] against errors of quadrature and fit."""
-    return at_most(at_least(x, 0.0), 1.0)
+    return clamp_max(clamp_min(x, 0.0), 1.0)

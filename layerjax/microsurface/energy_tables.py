@@ -32,15 +32,15 @@ import numpy as np
 from jax import Array
 
 from layerjax import channels, fresnel
-from layerjax._numerics import at_least, at_most, safe_sqrt
-from layerjax.channels import Channels, each
+from layerjax._numerics import clamp_max, clamp_min, safe_sqrt
+from layerjax.channels import Channels, map_channels
 from layerjax.microsurface.splines import read
 from layerjax.tables import load
 
 LARGEST_INDEX = 4.0
 """Ratio of the index on the far side to that on the near one, or its inverse."""
 
-FADED = 1e-5
+ENERGY_OFFSET = 1e-5
 """Added to energies before their root is taken: below it they are as good as 0."""
 
 SLICES = (0.05, 0.15, 0.3, 0.3, 0.15, 0.05)
@@ -50,7 +50,7 @@ REST = (0.2, 0.6, 0.2)
 """The same for the light that facets send on to other facets."""
 
 RETURNS = 3
-"""Numbers that say what a metal gives back of the rest: see `returned_share`."""
+"""Numbers that say what a metal gives back of the rest: see `multiple_reflectance`."""
 
 DIFFUSE = (
     (0.212340538239, 0.590533135559, 0.911412040487),
@@ -63,7 +63,7 @@ LEAST_ALPHA = 1e-4
 STEEPEST = 0.9685
 """The largest critical cosine: that of the largest index."""
 
-MOST = 6.0
+LARGEST_ATANH = 6.0
 """Bound of the inverse hyperbolic tangent of twice a share less 1."""
 
 
@@ -86,7 +86,7 @@ THINNER = Warp((5e-4, 0.5), 1e-3)
 
 MIRROR = Warp((0.0, 1.0), 0.0)
 
-RETAINED = Warp((0.0, 0.5), 0.0)
+ESCAPE_CONE = Warp((0.0, 0.5), 0.0)
 
 
 def interface_energies(cosine: Array, alpha: Array, ior: Array, multiple: bool) -> tuple[Array, Array]:
@@ -102,7 +102,7 @@ def interface_energies(cosine: Array, alpha: Array, ior: Array, multiple: bool) 
         return reflected, 1.0 - reflected
     root, passed = _dielectric(cosine, alpha, ior, 1, 2)
     reflected = _from_root(root) * mirror_energy(cosine, alpha)
-    return reflected, at_most(at_least(passed, 0.0), 1.0 - reflected)
+    return reflected, clamp_max(clamp_min(passed, 0.0), 1.0 - reflected)
 
 
 def single_reflectance(cosine: Array, alpha: Array, ior: Array) -> Array:
@@ -112,7 +112,7 @@ def single_reflectance(cosine: Array, alpha: Array, ior: Array) -> Array:
 
 def mirror_energy(cosine: Array, alpha: Array) -> Array:
     """Reflectance of rough facets that reflect all, single scattering."""
-    return at_most(_on_plane(cosine, alpha, "mirror", 1)[0], 1.0)
+    return clamp_max(_read_plane(cosine, alpha, "mirror", 1)[0], 1.0)
 
 
 def conductor_energies(cosine: Array, alpha: Array, ior: Channels, k: Channels, multiple: bool) -> Channels:
@@ -123,26 +123,26 @@ def conductor_energies(cosine: Array, alpha: Array, ior: Channels, k: Channels, 
         multiple: whether light is followed from facet to facet, and loses its Fresnel share at each.
     """
     if not multiple:
-        total, *facing = _on_plane(cosine, alpha, "mirror", 1 + len(SLICES))
+        total, *facing = _read_plane(cosine, alpha, "mirror", 1 + len(SLICES))
         (levels,) = _means_of_facets(facing, (SLICES,), ior, k)
-        return channels.times((at_most(total, 1.0),), levels)
-    total, *rest = _on_plane(cosine, alpha, "first", 1 + len(SLICES) + len(REST) + RETURNS)
+        return channels.multiply((clamp_max(total, 1.0),), levels)
+    total, *rest = _read_plane(cosine, alpha, "first", 1 + len(SLICES) + len(REST) + RETURNS)
     facing, returns = rest[:-RETURNS], rest[-RETURNS:]
     first, sent_on = _means_of_facets(facing, (SLICES, REST), ior, k)
     cosines, weights = DIFFUSE
     # by itself: of one metal it is the same in all directions
     smooth = [jnp.asarray(u, total.dtype) for u in (*cosines, 1.0)]
     mean, normal = _means_of_facets(smooth, (weights, (1.0,)), ior, k)
-    total = at_most(total, 1.0)
+    total = clamp_max(total, 1.0)
 
     def reflected(first: Array, sent_on: Array, mean: Array, normal: Array) -> Array:
-        more = (1.0 - total) * sent_on * returned_share(returns, mean, normal)
-        return at_most(at_least(total * first + more, 0.0), 1.0)
+        more = (1.0 - total) * sent_on * multiple_reflectance(returns, mean, normal)
+        return clamp_max(clamp_min(total * first + more, 0.0), 1.0)
 
-    return each(reflected, first, sent_on, mean, normal)
+    return map_channels(reflected, first, sent_on, mean, normal)
 
 
-def returned_share(returns: Sequence[Array], mean: Array, normal: Array) -> Array:
+def multiple_reflectance(returns: Sequence[Array], mean: Array, normal: Array) -> Array:
     """Share that a metal gives back of the light that its first facets have sent on to others.
 
     A geometric series: at every facet `returns[0]` of it leaves. What these reflect is the mean over all directions,
@@ -156,29 +156,29 @@ def returned_share(returns: Sequence[Array], mean: Array, normal: Array) -> Arra
     return (mean + second * slope) * leaves / (1.0 - (mean + further * slope) * (1.0 - leaves))
 
 
-def retained_share(cosine: Array, alpha: Array, ratio: Array) -> Array:
+def escape_cone_share(cosine: Array, alpha: Array, ratio: Array) -> Array:
     """Share of the lobe of `mirror_energy` that lies in sin(theta_o) < ratio; 1 for a ratio of 1 and above."""
     cosine, alpha, ratio = jnp.broadcast_arrays(cosine, alpha, ratio)
     below = ratio < 1.0
     tame = jnp.where(below, ratio, 0.5)
-    places = retained_places(cosine, alpha, safe_sqrt((1.0 - tame) * (1.0 + tame)))
+    places = escape_cone_places(cosine, alpha, safe_sqrt((1.0 - tame) * (1.0 + tame)))
     table = load("energies")
     (found,) = read(table["retained"], 0, SHAPES["retained"], places)
     return jnp.where(below, 0.5 * (1.0 + jnp.tanh(found)), 1.0)
 
 
-def retained_places(cosine: Array, alpha: Array, critical: Array) -> tuple[Array, Array, Array]:
-    """Where directions, widths and critical cosines lie on the axes of the table of `retained_share`.
+def escape_cone_places(cosine: Array, alpha: Array, critical: Array) -> tuple[Array, Array, Array]:
+    """Where directions, widths and critical cosines lie on the axes of the table of `escape_cone_share`.
 
     The cosine counts from the critical one, in what the width of the lobe is there, and extends beyond 1.
     """
-    width = RETAINED.cosine[1] * alpha * jnp.sqrt((1.0 - critical) * (1.0 + critical) + alpha * alpha)
+    width = ESCAPE_CONE.cosine[1] * alpha * jnp.sqrt((1.0 - critical) * (1.0 + critical) + alpha * alpha)
     inverse = 1.0 / width
     low, high = jnp.arcsinh(critical * inverse), jnp.arcsinh(inverse)
     along = (jnp.arcsinh((cosine - critical) * inverse) + low) / (low + high)
-    narrow = 1.0 / (RETAINED.cosine[1] * alpha)
+    narrow = 1.0 / (ESCAPE_CONE.cosine[1] * alpha)
     last = jnp.arcsinh(STEEPEST * narrow)
-    return along, _roughness(alpha, RETAINED.grain), jnp.arcsinh(critical * narrow) / last
+    return along, _alpha_place(alpha, ESCAPE_CONE.grain), jnp.arcsinh(critical * narrow) / last
 
 
 def dielectric_places(cosine: Array, alpha: Array, ior: Array) -> tuple[Array, Array, Array]:
@@ -186,13 +186,13 @@ def dielectric_places(cosine: Array, alpha: Array, ior: Array) -> tuple[Array, A
     below = ior < 1.0
     critical = safe_sqrt((1.0 - ior) * (1.0 + ior))
     width = jnp.where(below, _width(THINNER, alpha * ior), _width(DENSER, alpha))
-    rough = jnp.where(below, _roughness(alpha, THINNER.grain), _roughness(alpha, DENSER.grain))
-    return _stretched(cosine, critical, width), rough, index_variable(ior)
+    rough = jnp.where(below, _alpha_place(alpha, THINNER.grain), _alpha_place(alpha, DENSER.grain))
+    return _cosine_place(cosine, critical, width), rough, index_variable(ior)
 
 
 def mirror_places(cosine: Array, alpha: Array) -> tuple[Array, Array]:
     """Where directions and widths lie on the axes of tables of mirrors and metals."""
-    return _stretched(cosine, jnp.zeros_like(cosine), _width(MIRROR, alpha)), _roughness(alpha, MIRROR.grain)
+    return _cosine_place(cosine, jnp.zeros_like(cosine), _width(MIRROR, alpha)), _alpha_place(alpha, MIRROR.grain)
 
 
 def index_variable(ior: Array) -> Array:
@@ -215,7 +215,7 @@ def _dielectric(cosine: Array, alpha: Array, ior: Array, column: int, columns: i
     )
 
 
-def _on_plane(cosine: Array, alpha: Array, name: str, columns: int) -> list[Array]:
+def _read_plane(cosine: Array, alpha: Array, name: str, columns: int) -> list[Array]:
     """The first columns of a table over cosine and width."""
     cosine, alpha = jnp.broadcast_arrays(cosine, alpha)
     shape = SHAPES["mirror"]
@@ -230,7 +230,7 @@ def _means_of_facets(
 
     def add(sums: list[Channels], tabulated: tuple[Array, Array]) -> tuple[list[Channels], None]:
         u, shares = tabulated
-        levels = each(lambda ior, k: fresnel.conductor(at_most(at_least(u, 0.0), 1.0), ior, k), ior, k)
+        levels = map_channels(lambda ior, k: fresnel.conductor(clamp_max(clamp_min(u, 0.0), 1.0), ior, k), ior, k)
         after = []
         for total, share in zip(sums, shares, strict=True):
             after.append(tuple(before + share * level for before, level in zip(total, levels, strict=True)))
@@ -244,32 +244,32 @@ def _means_of_facets(
 
 
 def _from_root(root: Array) -> Array:
-    return at_most(at_least(root * root - FADED, 0.0), 1.0)
+    return clamp_max(clamp_min(root * root - ENERGY_OFFSET, 0.0), 1.0)
 
 
 def _width(warp: Warp, alpha: Array) -> Array:
     return warp.cosine[0] + warp.cosine[1] * alpha
 
 
-def _stretched(cosine: Array, critical: Array, width: Array) -> Array:
+def _cosine_place(cosine: Array, critical: Array, width: Array) -> Array:
     inverse = 1.0 / width
     low, high = jnp.arcsinh(critical * inverse), jnp.arcsinh((1.0 - critical) * inverse)
     return (jnp.arcsinh((cosine - critical) * inverse) + low) / (low + high)
 
 
-def _roughness(alpha: Array, grain: float) -> Array:
+def _alpha_place(alpha: Array, grain: float) -> Array:
     if grain:
         return jnp.arcsinh(alpha * (1.0 / grain)) * (1.0 / math.asinh(1.0 / grain))
-    return 1.0 - jnp.log(at_least(alpha, LEAST_ALPHA)) * (1.0 / math.log(LEAST_ALPHA))
+    return 1.0 - jnp.log(clamp_min(alpha, LEAST_ALPHA)) * (1.0 / math.log(LEAST_ALPHA))
 
 
-def unstretched(place: np.ndarray, critical: np.ndarray, width: np.ndarray) -> np.ndarray:
+def cosine_of_place(place: np.ndarray, critical: np.ndarray, width: np.ndarray) -> np.ndarray:
     """The cosine at a place on its axis."""
     low, high = np.arcsinh(critical / width), np.arcsinh((1.0 - critical) / width)
     return critical + width * np.sinh(place * (low + high) - low)
 
 
-def rough_of(place: np.ndarray, grain: float) -> np.ndarray:
+def alpha_of_place(place: np.ndarray, grain: float) -> np.ndarray:
     """The width alpha at a place on its axis."""
     return grain * np.sinh(place * math.asinh(1.0 / grain)) if grain else LEAST_ALPHA ** (1.0 - place)
 

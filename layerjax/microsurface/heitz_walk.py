@@ -42,7 +42,7 @@ def escape_probability(w: Vector, height: Array, alpha: Array) -> Array:
     return jnp.exp(-optical_depth(w, height, alpha))
 
 
-def height_overturned(height: Array) -> Array:
+def opposite_height(height: Array) -> Array:
     """Height counted from the other side of the surface, -log(1 - exp(-height)), to rounding at both ends."""
     height = jnp.maximum(height, jnp.finfo(height.dtype).tiny)  # 0 would lie infinitely deep on the other side
     small = height < 0.6931
@@ -58,4 +58,4 @@ def meet_facet(wi: Vector, alpha: Array, u1: Array, u2: Array) -> tuple[Vector, 
 def pass_through(wi: Vector, m: Vector, ior: Array, height: Array) -> tuple[Vector, Array, Array]:
     """Direction and height of light refracted at a facet, both as seen from the other side, and whether it exists."""
     refracted, exists = refract(wi, m, ior)
-    return flip(refracted), height_overturned(height), exists
+    return flip(refracted), opposite_height(height), exists

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from layerjax._numerics import at_least, at_most, broadcasting, horner, unstacked
+from layerjax._numerics import allow_broadcasting, clamp_max, clamp_min, horner, unstack
 
 BASIS = np.array([[1.0, -3.0, 3.0, -1.0], [4.0, 0.0, -6.0, 3.0], [1.0, 3.0, 3.0, -3.0], [0.0, 0.0, 0.0, 1.0]]) / 6.0
 """Weights of the four coefficients that count at a place: of each the polynomial in how far it is beyond the first."""
@@ -33,7 +33,7 @@ def design(places: np.ndarray, count: int) -> np.ndarray:
     return matrix
 
 
-def fitted(values: np.ndarray, counts: Sequence[int]) -> np.ndarray:
+def fit_splines(values: np.ndarray, counts: Sequence[int]) -> np.ndarray:
     """Coefficients (counts) of the splines that come nearest to values on a grid, uniform on [0, 1] along each axis."""
     for axis, count in enumerate(counts):
         inverse = np.linalg.pinv(design(np.linspace(0.0, 1.0, values.shape[axis]), count))
@@ -47,8 +47,8 @@ def taps(place: Array, count: Array | int) -> tuple[Array, Array, Array]:
     The distance is in steps, so many of which the axis has.
     """
     steps = jnp.asarray(count - 3, place.dtype)
-    x = at_most(at_least(place, 0.0), 1.0) * steps
-    first = at_most(jnp.floor(x), steps - 1.0)
+    x = clamp_max(clamp_min(place, 0.0), 1.0) * steps
+    first = clamp_max(jnp.floor(x), steps - 1.0)
     return first.astype(jnp.int32), x - first, steps
 
 
@@ -78,26 +78,26 @@ def read(
     sizes = [jnp.asarray(count, jnp.int32) for count in counts]
     reader = _reader(len(places), columns, column_stride)
     found = reader(jnp.asarray(flat, dtype), jnp.asarray(start, jnp.int32), *sizes, *places)
-    return unstacked(found) if columns > 1 else [found]
+    return unstack(found) if columns > 1 else [found]
 
 
 @functools.cache
 def _reader(axes: int, columns: int, column_stride: int) -> Callable[..., Array]:
     @jax.custom_jvp
     def value(flat: Array, start: Array, *rest: Array) -> Array:
-        return _summed(flat, start, rest[:axes], rest[axes:], columns, column_stride, sloped=False)[0]
+        return _sum_taps(flat, start, rest[:axes], rest[axes:], columns, column_stride, sloped=False)[0]
 
     @value.defjvp
-    @broadcasting
+    @allow_broadcasting
     def _(primals: tuple[Array, ...], tangents: tuple[Array, ...]) -> tuple[Array, Array]:
         flat, start, *rest = primals
-        found, *slopes = _summed(flat, start, rest[:axes], rest[axes:], columns, column_stride, sloped=True)
+        found, *slopes = _sum_taps(flat, start, rest[:axes], rest[axes:], columns, column_stride, sloped=True)
         return found, _dot(slopes, tangents[2 + axes :])
 
     return value
 
 
-def _summed(
+def _sum_taps(
     flat: Array,
     start: Array,
     counts: Sequence[Array],

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from layerjax._numerics import at_least, at_most, safe_sqrt
+from layerjax._numerics import clamp_max, clamp_min, safe_sqrt
 from layerjax.quadrature import gauss_legendre, panels
 
 UPRIGHT = 1e-6
@@ -61,11 +61,11 @@ class Facets(NamedTuple):
     upright: Array
     """Cosine of the facet normal."""
 
-    def reflected(self) -> Array:
+    def reflected_cosine(self) -> Array:
         """Cosine of the direction that a facet reflects to, negative below the horizon."""
         return 2.0 * self.facing * self.upright - self.cosine
 
-    def refracted(self, ior: Array) -> Array:
+    def refracted_cosine(self, ior: Array) -> Array:
         """Cosine of the direction that a facet refracts to, on the far side; no meaning under total reflection."""
         inside = safe_sqrt((ior - 1.0) * (ior + 1.0) + self.facing * self.facing) / ior
         return (self.cosine - self.facing * self.upright) / ior + inside * self.upright
@@ -77,7 +77,7 @@ class Facets(NamedTuple):
 
 def make_cap(cosine: Array, alpha: Array) -> Cap:
     """The cap of facets seen at `cosine` > 0; both arrays of one shape."""
-    sine = jnp.sqrt(at_least((1.0 - cosine) * (1.0 + cosine), 0.0) + UPRIGHT * cosine * cosine)
+    sine = jnp.sqrt(clamp_min((1.0 - cosine) * (1.0 + cosine), 0.0) + UPRIGHT * cosine * cosine)
     cosine = cosine * float(np.sqrt(1.0 - UPRIGHT))
     x = alpha * sine
     stretch = jnp.sqrt(x * x + cosine * cosine)
@@ -102,7 +102,7 @@ def cone(cap: Cap, sine: Array) -> Region:
     return Region((_polar(cap, 0.5 * (cap.angle + edge)), _polar(cap, 0.5 * (cap.angle - edge))), cut)
 
 
-def refracting(cap: Cap, ior: Array) -> Region:
+def refraction_region(cap: Cap, ior: Array) -> Region:
     """Facets that do not reflect totally; all of them if ior, the index on the far side over this one's, is >= 1."""
     squared = jnp.where(ior < 1.0, (1.0 - ior) * (1.0 + ior), 0.0)  # cosine of the critical angle, squared
     critical = jnp.arctan2(jnp.where(squared > 0, ior, 1.0), safe_sqrt(squared))
@@ -115,10 +115,10 @@ def refracting(cap: Cap, ior: Array) -> Region:
         tall = c * (height / cap.stretch) ** 2 * (1.0 - cap.alpha) * (1.0 + cap.alpha)
         return facing - half - safe_sqrt(half * half + tall), cap.vx * s
 
-    return Region((_polar(cap, at_most(cap.angle + critical, 0.5 * jnp.pi)), _polar(cap, cap.angle - critical)), cut)
+    return Region((_polar(cap, clamp_max(cap.angle + critical, 0.5 * jnp.pi)), _polar(cap, cap.angle - critical)), cut)
 
 
-def everything(cap: Cap) -> Region:
+def whole_region(cap: Cap) -> Region:
     """All facets, with circles as for the horizon."""
     horizon = cone(cap, jnp.ones_like(cap.cosine))
     rim = jnp.pi - cap.tilt
@@ -129,22 +129,22 @@ def everything(cap: Cap) -> Region:
     return Region((horizon.touches[1], rim), cut)
 
 
-def facets_in(cap: Cap, region: Region, points: int) -> Facets:
+def region_facets(cap: Cap, region: Region, points: int) -> Facets:
     """Points in a region."""
-    t, w = _circles(cap, _in_order(region.touches), points)
+    t, w = _circles(cap, _sort_pair(region.touches), points)
     start, end = _arc(*region.cut(cap.inner(), t))
-    return _facets(cap, t, w, start, end, _crowded, _azimuths(points))
+    return _facets(cap, t, w, start, end, _graded_nodes, _azimuths(points))
 
 
-def facets_split(cap: Cap, region: Region, inner: Region, points: int) -> Facets:
+def split_facets(cap: Cap, region: Region, inner: Region, points: int) -> Facets:
     """Points in a region, split where another one ends."""
-    low, high = _in_order(region.touches)
-    edges = jnp.sort(jnp.stack([low, high, *(at_most(touch, high) for touch in inner.touches)], axis=-1), axis=-1)
+    low, high = _sort_pair(region.touches)
+    edges = jnp.sort(jnp.stack([low, high, *(clamp_max(touch, high) for touch in inner.touches)], axis=-1), axis=-1)
     t, w = _circles(cap, tuple(jnp.moveaxis(edges, -1, 0)), points)
     start, end = _arc(*region.cut(cap.inner(), t))
     _, between = _arc(*inner.cut(cap.inner(), t))
-    between = at_least(at_most(between, end), start)
-    near = _facets(cap, t, w, start, between, _crowded, _azimuths(points))
+    between = clamp_min(clamp_max(between, end), start)
+    near = _facets(cap, t, w, start, between, _graded_nodes, _azimuths(points))
     rest = _facets(cap, t, w, between, end, _even, _azimuths(points))
     joined = (jnp.concatenate(parts, axis=-1) for parts in zip(near[2:], rest[2:], strict=True))
     return Facets(near.alpha, near.cosine, *joined)
@@ -154,7 +154,7 @@ def _azimuths(points: int) -> int:
     return (2 * points + 2) // 3
 
 
-def _crowded(nodes: int) -> tuple[np.ndarray, np.ndarray]:
+def _graded_nodes(nodes: int) -> tuple[np.ndarray, np.ndarray]:
     """Nodes and weights on [0, 1] for integrands that end like a square root at 1."""
     s, w = gauss_legendre(nodes)
     return s * (2.0 - s), 2.0 * w * (1.0 - s)
@@ -166,10 +166,10 @@ _even = gauss_legendre
 def _polar(cap: Cap, angle: Array) -> Array:
     """t of the facet in the plane of incidence at this angle from the normal, towards wi."""
     stretched = jnp.arctan2(jnp.sin(angle), cap.alpha * jnp.cos(angle))
-    return at_most(jnp.abs(2.0 * stretched - cap.tilt), jnp.pi - cap.tilt)
+    return clamp_max(jnp.abs(2.0 * stretched - cap.tilt), jnp.pi - cap.tilt)
 
 
-def _in_order(pair: tuple[Array, Array]) -> tuple[Array, Array]:
+def _sort_pair(pair: tuple[Array, Array]) -> tuple[Array, Array]:
     a, b = pair
     return jnp.where(a < b, a, b), jnp.where(a < b, b, a)
 

@@ -16,17 +16,17 @@ from typing import Literal, NamedTuple
 import jax.numpy as jnp
 from jax import Array
 
-from layerjax._numerics import at_least, at_most, safe_div, safe_sqrt
+from layerjax._numerics import clamp_max, clamp_min, safe_div, safe_sqrt
 from layerjax.directions import Vector
 from layerjax.normals import vmf
 from layerjax.normals.facets import Distribution
 from layerjax.normals.ggx import ggx_masking
 from layerjax.quadrature import gauss_legendre
 
-REACH = 3.0
+STRETCH_LIMIT = 3.0
 """Where the sinh of the stretch is bent to end: the narrowest lobe keeps points in its middle."""
 
-VMF_REACH = 3.4
+VMF_EXTENT = 3.4
 """Widths alpha from their peak to where vMF normals end: 1e-5 of them lie beyond."""
 
 SOFT = 0.6
@@ -34,7 +34,7 @@ SOFT = 0.6
 
 LEAST_COSINE = 1e-9
 
-Way = Literal["reflected", "refracted"]
+FacetEvent = Literal["reflected", "refracted"]
 
 
 class Parallels(NamedTuple):
@@ -63,7 +63,7 @@ def parallels(
     alpha: Array,
     distribution: Distribution,
     ratio: Array,
-    way: Way,
+    event: FacetEvent,
 ) -> Parallels:
     """What facets at the angles `polar` (see `polar_angles`) from directions, (nodes,), have in common.
 
@@ -71,19 +71,19 @@ def parallels(
         cosine, sine: of w, (nodes,).
         alpha, distribution: of the normals.
         ratio: index on the far side over that on the side of w.
-        way: what becomes of the light: "reflected", to above the horizon, or "refracted".
+        event: what becomes of the light: "reflected", to above the horizon, or "refracted".
     """
     apart, measure = polar
     mu, sin_w = cosine[:, None], sine[:, None]
     sin_apart, cos_apart = jnp.sin(apart), jnp.cos(apart)
-    c = at_least(mu * cos_apart - sin_w * sin_apart, LEAST_COSINE)
-    s = at_least(sin_w * cos_apart + mu * sin_apart, 0.0)
+    c = clamp_min(mu * cos_apart - sin_w * sin_apart, LEAST_COSINE)
+    s = clamp_min(sin_w * cos_apart + mu * sin_apart, 0.0)
     if distribution == "ggx":
         # the density of normals is that of 1 / (near + (far - near) sin(psi/2)^2)^2, nearly
         scale = 1.0 / (1.0 + 0.5 * alpha * alpha)
         least = 0.5 * alpha * alpha * scale
-        near = least + scale * sin_apart * sin_apart / (1.0 + at_least(cos_apart, 0.0))
-        far = least + scale * at_least(1.0 - mu * c + sin_w * s, 0.0)
+        near = least + scale * sin_apart * sin_apart / (1.0 + clamp_min(cos_apart, 0.0))
+        far = least + scale * clamp_min(1.0 - mu * c + sin_w * s, 0.0)
         squeeze = jnp.sqrt(near / far)
         visible = ggx_masking((-sin_w, jnp.zeros_like(mu), mu), alpha) / mu
         density = (8.0 / jnp.pi) * alpha * alpha
@@ -92,19 +92,19 @@ def parallels(
         visible = vmf.masking_over_cosine(mu, vmf.concentration(alpha))
         density = jnp.asarray(8.0, mu.dtype)
     # psi ends where the normal, or the light mirrored at it, reaches the horizon
-    level, swing = mu * c - (0.5 * mu / c if way == "reflected" else 0.0), sin_w * s
+    level, swing = mu * c - (0.5 * mu / c if event == "reflected" else 0.0), sin_w * s
     end = _azimuth_of(swing, level, squeeze)
     if distribution == "vmf":
         # the density goes like exp(-2 kappa sin_w s sin(psi/2)^2): by this sine, and up to a tangent of psi/4 beyond it
-        last = VMF_REACH / jnp.sqrt(1.0 + 2.0 * vmf.concentration(alpha) * swing)
-        end = at_most(end, 0.5 * last * (1.0 + last * last))
+        last = VMF_EXTENT / jnp.sqrt(1.0 + 2.0 * vmf.concentration(alpha) * swing)
+        end = clamp_max(end, 0.5 * last * (1.0 + last * last))
     start = None
-    if way == "refracted":
+    if event == "refracted":
         total = ratio < 1.0  # else all of the light comes through
         n = jnp.where(total, ratio, 0.5)
         # of normals, mz at most: mu / (c - n cos(theta_t)), without the difference
         highest = mu * (c + n * safe_sqrt(1.0 - (s / n) ** 2)) / ((1.0 - n) * (1.0 + n))
-        start = jnp.where(total, at_most(_azimuth_of(swing, mu * c - highest, squeeze), end), 0.0)
+        start = jnp.where(total, clamp_max(_azimuth_of(swing, mu * c - highest, squeeze), end), 0.0)
     return Parallels(sin_apart, cos_apart, c, s, squeeze, end, density * measure * s * c * visible, start)
 
 
@@ -114,8 +114,8 @@ def _azimuth_of(swing: Array, level: Array, squeeze: Array) -> Array:
     return safe_div(up, down + safe_sqrt(up * up + down * down))
 
 
-def seen_facets(
-    cosine: Array, sine: Array, at: Parallels, alpha: Array, distribution: Distribution, azimuths: int
+def visible_normals(
+    cosine: Array, sine: Array, circles: Parallels, alpha: Array, distribution: Distribution, azimuths: int
 ) -> tuple[Vector, Array, Array]:
     """Normals m seen along w = (-sine, 0, cosine), m . w, and their shares of the visible area: (nodes, points) each.
 
@@ -124,25 +124,25 @@ def seen_facets(
 
     Args:
         cosine, sine: of w, (nodes,).
-        at: where they lie.
+        circles: where they lie.
         alpha, distribution: of the normals.
         azimuths: points in psi.
     """
     mu, sin_w = cosine[:, None], sine[:, None]
     # tan(psi/2) is squeezed; in terms of v, the tangent of half of the angle that has it then
     x, w = (jnp.asarray(array, mu.dtype) for array in gauss_legendre(azimuths))
-    width, v = at.end, at.end[..., None] * x
-    if at.start is not None:
-        width = at.end - at.start
-        v = at.start[..., None] + width[..., None] * x
-    cos_half, sin_half = (1.0 - v) * (1.0 + v), 2.0 * at.squeeze[..., None] * v
+    width, v = circles.end, circles.end[..., None] * x
+    if circles.start is not None:
+        width = circles.end - circles.start
+        v = circles.start[..., None] + width[..., None] * x
+    cos_half, sin_half = (1.0 - v) * (1.0 + v), 2.0 * circles.squeeze[..., None] * v
     norm = 1.0 / (cos_half * cos_half + sin_half * sin_half)
-    turn = (at.level * width * at.squeeze)[..., None] * w * norm * (1.0 + v * v)
+    turn = (circles.level * width * circles.squeeze)[..., None] * w * norm * (1.0 + v * v)
     back = 2.0 * sin_half * sin_half * norm  # 1 - cos(psi)
     # no differences of large numbers where lobes are narrow
-    mx = at.sine[..., None] - (mu * at.across)[..., None] * back
-    my = at.across[..., None] * 2.0 * sin_half * cos_half * norm
-    mz = at.cosine[..., None] - (sin_w * at.across)[..., None] * back
+    mx = circles.sine[..., None] - (mu * circles.across)[..., None] * back
+    my = circles.across[..., None] * 2.0 * sin_half * cos_half * norm
+    mz = circles.cosine[..., None] - (sin_w * circles.across)[..., None] * back
     if distribution == "ggx":
         # in units of alpha: fourth powers of the narrowest have derivatives beyond single precision
         slopes = (mx / alpha) ** 2 + (my / alpha) ** 2
@@ -150,12 +150,12 @@ def seen_facets(
     else:
         shares = turn * vmf.hemisphere_density((mx, my, mz), vmf.concentration(alpha))
     flat = (mu.shape[0], -1)
-    facing = at.facing[..., None] * jnp.ones_like(back)
+    facing = circles.facing[..., None] * jnp.ones_like(back)
     return (mx.reshape(flat), my.reshape(flat), mz.reshape(flat)), facing.reshape(flat), shares.reshape(flat)
 
 
 def polar_angles(
-    cosine: Array, sine: Array, alpha: Array, distribution: Distribution, ratio: Array, way: Way, points: int
+    cosine: Array, sine: Array, alpha: Array, distribution: Distribution, ratio: Array, event: FacetEvent, points: int
 ) -> tuple[Array, Array]:
     """theta_d - theta and its measure, (nodes, panels * points).
 
@@ -165,13 +165,13 @@ def polar_angles(
     total = ratio < 1.0  # reflection beyond the critical angle
     critical = jnp.where(total, jnp.arcsin(jnp.where(total, ratio, 0.5)), 0.5 * jnp.pi)
     quarter = 0.5 * jnp.pi
-    if way == "reflected":
+    if event == "reflected":
         cut, end = 0.5 * (quarter - theta), 0.5 * (quarter + theta)
-        inner = at_most(critical, end)
+        inner = clamp_max(critical, end)
     else:
-        cut, end = quarter - theta, at_most(critical, quarter) * jnp.ones_like(theta)
+        cut, end = quarter - theta, clamp_max(critical, quarter) * jnp.ones_like(theta)
         inner = _grazing(cosine, sine, ratio, end)
-    cut = at_most(cut, end)
+    cut = clamp_max(cut, end)
     low, high = jnp.where(cut < inner, cut, inner), jnp.where(cut < inner, inner, cut)
     edges = jnp.concatenate([jnp.zeros_like(theta), low, high, end], axis=1)
     places = _place((edges - theta) / alpha, distribution)
@@ -182,9 +182,9 @@ def polar_angles(
         share = jnp.where(root[..., None], 1.0 - (1.0 - x) ** 2, x)
         measure = jnp.where(root[..., None], 2.0 * (1.0 - x) * w, w)
     else:
-        share, rise = _rounded(places, x)
+        share, rise = _smooth_edges(places, x)
         measure = rise * w
-    stretched, slope = _stretched(first + width * share, distribution)
+    stretched, slope = _inverse_place(first + width * share, distribution)
     flat = (theta.shape[0], -1)
     return (alpha * stretched).reshape(flat), (alpha * width * measure * slope).reshape(flat)
 
@@ -194,16 +194,16 @@ def _grazing(cosine: Array, sine: Array, ratio: Array, end: Array) -> Array:
     angle meets."""
     beyond = sine > ratio
     within = jnp.where(beyond, 1.0 / jnp.where(beyond, ratio, 1.0) - sine, 1.0)
-    return jnp.where(beyond[:, None], at_most(jnp.arctan2(cosine, within)[:, None], end), end)
+    return jnp.where(beyond[:, None], clamp_max(jnp.arctan2(cosine, within)[:, None], end), end)
 
 
-def _rounded(places: Array, x: Array) -> tuple[Array, Array]:
+def _smooth_edges(places: Array, x: Array) -> tuple[Array, Array]:
     """Shares of panels at x in (0, 1), and their slopes: with the roots at the edges taken out.
 
     Sums over parallels that begin to be cut, or end, have a root there, and so has refraction at the critical angle.
     Where normals end before the edge there is none, and points are not crowded to it.
     """
-    depth = jnp.clip((VMF_REACH - jnp.abs(places)) / (SOFT * VMF_REACH), 0.0, 1.0)
+    depth = jnp.clip((VMF_EXTENT - jnp.abs(places)) / (SOFT * VMF_EXTENT), 0.0, 1.0)
     level = depth * depth * (3.0 - 2.0 * depth)
     after, before = level[:, 1:, None], level.at[:, 0].set(0.0)[:, :-1, None]
     rest = 1.0 - x
@@ -213,16 +213,16 @@ def _rounded(places: Array, x: Array) -> tuple[Array, Array]:
 
 def _place(t: Array, distribution: Distribution) -> Array:
     if distribution == "vmf":
-        return jnp.clip(t, -VMF_REACH, VMF_REACH)
+        return jnp.clip(t, -VMF_EXTENT, VMF_EXTENT)
     y = jnp.arcsinh(t)
-    return y / jnp.sqrt(1.0 + (y / REACH) ** 2)
+    return y / jnp.sqrt(1.0 + (y / STRETCH_LIMIT) ** 2)
 
 
-def _stretched(place: Array, distribution: Distribution) -> tuple[Array, Array]:
+def _inverse_place(place: Array, distribution: Distribution) -> tuple[Array, Array]:
     """t of a place, and its slope: the inverse of `_place`."""
     if distribution == "vmf":
         return place, jnp.ones_like(place)
-    inverse = 1.0 / jnp.sqrt(1.0 - (place / REACH) ** 2)
+    inverse = 1.0 / jnp.sqrt(1.0 - (place / STRETCH_LIMIT) ** 2)
     y = place * inverse
     rise = jnp.expm1(y)
     fall = rise / (1.0 + rise)

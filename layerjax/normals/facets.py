@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from layerjax._checks import require_choice
-from layerjax._numerics import at_least, at_most, safe_div, safe_sqrt
+from layerjax._numerics import clamp_max, clamp_min, safe_div, safe_sqrt
 from layerjax._parameters import check_range, is_placeholder
 from layerjax.directions import Vector, dot
 from layerjax.normals import vmf
@@ -48,7 +48,7 @@ def density(m: Vector, alpha: Array, distribution: Distribution) -> Array:
     return vmf.hemisphere_density(m, vmf.concentration(alpha))
 
 
-def twice_seen(cosine: Array, w: Vector, alpha: Array, distribution: Distribution) -> Array:
+def twice_projected_area(cosine: Array, w: Vector, alpha: Array, distribution: Distribution) -> Array:
     """2 cos / G1(w): twice the projected area of the facets seen along w, which has this cosine >= 0 with the normal.
 
     Densities of light that a facet scatters are quotients by it, so that no cosine is left to divide by.
@@ -60,7 +60,7 @@ def twice_seen(cosine: Array, w: Vector, alpha: Array, distribution: Distributio
 
 def masking(w: Vector, alpha: Array, distribution: Distribution) -> Array:
     """Smith masking G1(w) for w above the horizon."""
-    return 2.0 * w[2] / twice_seen(w[2], w, alpha, distribution)
+    return 2.0 * w[2] / twice_projected_area(w[2], w, alpha, distribution)
 
 
 def sample(wi: Vector, alpha: Array, u1: Array, u2: Array, distribution: Distribution) -> Vector:
@@ -84,7 +84,7 @@ def reflection_pdf(h: Vector, wi: Vector, alpha: Array, distribution: Distributi
         return ggx_density(h, alpha) * ggx_masking(wi, alpha) / (4.0 * wi[2])
     kappa = vmf.concentration(alpha)
     drawn = _share_drawn(wi, h, kappa) * vmf.hemisphere_norm(kappa) * vmf.hemisphere_density(h, kappa)
-    return drawn / (4.0 * at_least(dot(wi, h), LEAST_WEIGHT))
+    return drawn / (4.0 * clamp_min(dot(wi, h), LEAST_WEIGHT))
 
 
 def draw_weight(wi: Vector, m: Vector, alpha: Array) -> Array:
@@ -93,8 +93,8 @@ def draw_weight(wi: Vector, m: Vector, alpha: Array) -> Array:
     It may be divided by: at the rim it stays above 0.
     """
     kappa = vmf.concentration(alpha)
-    seen = at_least(dot(wi, m), 0.0) * vmf.masking_over_cosine(wi[2], kappa)
-    return at_least(seen / (vmf.hemisphere_norm(kappa) * _share_drawn(wi, m, kappa)), LEAST_WEIGHT)
+    seen = clamp_min(dot(wi, m), 0.0) * vmf.masking_over_cosine(wi[2], kappa)
+    return clamp_min(seen / (vmf.hemisphere_norm(kappa) * _share_drawn(wi, m, kappa)), LEAST_WEIGHT)
 
 
 def rule(wi: Vector, alpha: Array, nodes: int, distribution: Distribution) -> Nodes:
@@ -115,7 +115,7 @@ def _plane(wi: Vector) -> tuple[Array, Array, Array]:
 def _azimuths(level: Array, swing: Array) -> tuple[Array, Array]:
     """Of normals with <wi, m> = level + swing cos(phi): slope of the density of phi / rim, and the last phi seen."""
     cut = swing > level
-    slope = at_most(safe_div(jnp.where(cut, 0.0, swing), jnp.where(cut, 1.0, level)), MOST_SLOPE)
+    slope = clamp_max(safe_div(jnp.where(cut, 0.0, swing), jnp.where(cut, 1.0, level)), MOST_SLOPE)
     return jnp.where(cut, MOST_SLOPE, slope), jnp.where(cut, _rim(level, swing, cut), jnp.pi)
 
 
@@ -133,7 +133,7 @@ def _share_drawn(wi: Vector, m: Vector, kappa: Array) -> Array:
     along, across = x * m[0] + y * m[1], x * m[1] - y * m[0]
     upright = sine == 0
     phi = jnp.abs(jnp.arctan2(jnp.where(upright, 0.0, across), jnp.where(upright, 1.0, along)))
-    return jnp.pi * (1.0 + slope * (1.0 - 2.0 * at_most(phi / rim, 1.0))) / (rim * vmf.upper_share(kappa))
+    return jnp.pi * (1.0 + slope * (1.0 - 2.0 * clamp_max(phi / rim, 1.0))) / (rim * vmf.upper_share(kappa))
 
 
 def _mirror_rule(wi: Vector, kappa: Array, nodes: int) -> Nodes:
@@ -143,9 +143,9 @@ def _mirror_rule(wi: Vector, kappa: Array, nodes: int) -> Nodes:
     """
     planar, x, y = _plane(wi)
     theta = jnp.arctan2(planar, wi[2])
-    drop = at_most(TAIL * TAIL / kappa, 1.0)
+    drop = clamp_max(TAIL * TAIL / kappa, 1.0)
     last = 2.0 * jnp.arctan2(safe_sqrt(0.5 * drop), safe_sqrt(1.0 - 0.5 * drop))
-    edges = [jnp.zeros_like(theta), *(at_most(0.25 * jnp.pi + 0.5 * side * theta, last) for side in (-1.0, 1.0))]
+    edges = [jnp.zeros_like(theta), *(clamp_max(0.25 * jnp.pi + 0.5 * side * theta, last) for side in (-1.0, 1.0))]
     polar, w_polar = panels(jnp.stack(edges, axis=-1), nodes)
     sine, cosine = jnp.sin(polar), jnp.cos(polar)
     # wo.z = cos(theta_i) cos(2 polar) + sin(theta_i) sin(2 polar) cos(phi)

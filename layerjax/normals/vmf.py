@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jax import Array
 from jax.scipy.special import ndtr
 
-from layerjax._numerics import at_least, at_most, exprel, safe_sqrt
+from layerjax._numerics import clamp_max, clamp_min, exprel, safe_sqrt
 from layerjax.directions import Vector
 
 Masking = Literal["normal", "paper"]
@@ -90,7 +90,7 @@ def resultant_slope(kappa: Array) -> Array:
     return jnp.where(small, series, 1.0 / (outer * outer) - 4.0 * decay / (1.0 - decay) ** 2)
 
 
-def convolved(*pairs: tuple[Array, Array]) -> tuple[Array, Array]:
+def convolve(*pairs: tuple[Array, Array]) -> tuple[Array, Array]:
     """(R, 1 - R) of independent turns that follow each other: R is the product of theirs."""
     length, rest = pairs[0]
     for other, missing in pairs[1:]:
@@ -102,7 +102,7 @@ def convolved(*pairs: tuple[Array, Array]) -> tuple[Array, Array]:
 @jax.custom_jvp
 def concentration_of(length: Array, rest: Array) -> Array:
     """kappa with A3(kappa) = length; `rest` is 1 - length with its own digits (Newton from a closed-form start)."""
-    missing = at_least(rest, 1e-30)
+    missing = clamp_min(rest, 1e-30)
     kappa = length * (3.0 - length * length) / (missing * (1.0 + length))
     for _ in range(4):
         value, left = resultant(kappa)
@@ -126,7 +126,7 @@ def projected_area(cosine: Array, kappa: Array, masking: Masking = "normal") -> 
     "normal": <o, m> taken as normally distributed, with its own mean and variance; G1 is then exact within 0.03 from
     kappa = 2 on (0.001 at 100). "paper": Guo 2015, Eq. (8), off by 0.06 at kappa = 3 and by 0.4 at 100 near grazing.
     """
-    cosine = at_most(cosine, 1.0)  # directions may be longer than 1 by `UNIT_SLACK`
+    cosine = clamp_max(cosine, 1.0)  # directions may be longer than 1 by `UNIT_SLACK`
     length, _ = resultant(kappa)
     if masking == "paper":
         a, b = 0.25 * (length + 1.0) ** 2, jnp.cbrt(length)
@@ -135,7 +135,7 @@ def projected_area(cosine: Array, kappa: Array, masking: Masking = "normal") -> 
     mean = length * cosine
     squared = cosine * cosine
     # A3 / kappa is 1/3 at kappa = 0
-    across = length / at_least(kappa, 1e-12)
+    across = length / clamp_min(kappa, 1e-12)
     deviation = safe_sqrt(squared * resultant_slope(kappa) + (1.0 - squared) * across)
     z = mean / deviation
     return mean * ndtr(z) + deviation * jnp.exp(-0.5 * z * z) / jnp.sqrt(2.0 * jnp.pi)
@@ -149,8 +149,8 @@ def masking(cosine: Array, kappa: Array, form: Masking = "normal") -> Array:
 def masking_over_cosine(cosine: Array, kappa: Array, form: Masking = "normal") -> Array:
     """G1 / cos = N / P, without dividing by a cosine that may be 0."""
     norm = hemisphere_norm(kappa)
-    area = at_least(projected_area(cosine, kappa, form), LEAST_AREA)
-    return norm / at_least(area, norm * cosine)
+    area = clamp_min(projected_area(cosine, kappa, form), LEAST_AREA)
+    return norm / clamp_min(area, norm * cosine)
 
 
 def hemisphere_sample(kappa: Array, u1: Array, u2: Array) -> Vector:

@@ -8,7 +8,7 @@ import numpy as np
 from jax import Array
 
 from layerjax._parameters import Parameter
-from layerjax._shown import Shown
+from layerjax._repr import ReprModule
 from layerjax.directions import Vector, add, combine, frame, scale
 from layerjax.normals.sggx import Kind
 from layerjax.quadrature import Rule, sphere_rule
@@ -22,13 +22,13 @@ class Flakes(NamedTuple):
     axis: Parameter
 
 
-class PhaseFunction(Shown):
+class PhaseFunction(ReprModule):
     """Base class of phase functions: p(wi, wo), which integrates to 1 over wo, and the extinction sigma(w).
 
     Directions are components that point away from the collision (see `layerjax.directions`): unscattered light has wo =
     -wi. The kernel sigma(wi) p(wi, wo) must be symmetric in wi and wo, and the same for -wi and -wo. A subclass has to
-    define `pdf` and `sample`; also `cross_section` if sigma is not 1, and `is_upright` and `mirrored` if p depends on
-    azimuth. The other methods improve speed or accuracy, or are needed by further transports.
+    define `pdf` and `sample`; also `cross_section` if sigma is not 1, and `is_axisymmetric` and `mirror` if p depends
+    on azimuth. The other methods improve speed or accuracy, or are needed by further transports.
 
     Parameters are fields made by `layerjax._parameters.parameter`, which takes the range of a new one as `limits`.
     """
@@ -84,7 +84,7 @@ class PhaseFunction(Shown):
         return 1.0
 
     @property
-    def onward_width(self) -> Parameter:
+    def ballistic_width(self) -> Parameter:
         """Angle in radians, up to 1, over which the ballistic part of a forward peak falls off.
 
         It matters for transmission through the medium, beside `width`.
@@ -92,15 +92,15 @@ class PhaseFunction(Shown):
         return 1.0
 
     @property
-    def is_upright(self) -> bool:
+    def is_axisymmetric(self) -> bool:
         """Whether p and sigma are known (while tracing) not to change if all directions turn about the normal."""
         return True
 
-    def simplified(self) -> "PhaseFunction":
+    def simplify(self) -> "PhaseFunction":
         """This phase function without an axis that is known to be the normal, so that it stays known under tracing."""
         return self
 
-    def mirrored(self) -> "PhaseFunction":
+    def mirror(self) -> "PhaseFunction":
         """The phase function upside down: its p(wi, wo) is this one's with the z of both directions turned round."""
         return self
 
@@ -118,7 +118,7 @@ class PhaseFunction(Shown):
         return None
 
 
-def deflected(wi: Vector, cosine: Array, sine: Array, phi: Array) -> Vector:
+def deflect(wi: Vector, cosine: Array, sine: Array, phi: Array) -> Vector:
     """Light along wi, turned by an angle with that cosine and sine at the azimuth phi about where it was going."""
     axis = scale(-1.0, wi)
     tangent, bitangent = frame(axis)

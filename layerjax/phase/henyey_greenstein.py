@@ -4,10 +4,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from layerjax._known import known_values
+from layerjax._concrete import concrete_values
 from layerjax._parameters import Parameter, parameter
 from layerjax.directions import Vector, add, combine, dot
-from layerjax.phase.contract import PhaseFunction, deflected
+from layerjax.phase.contract import PhaseFunction, deflect
 from layerjax.quadrature import Rule, henyey_greenstein_inverse, henyey_greenstein_rule
 
 ASSUMED_FORWARD, ASSUMED_BACKWARD = 0.9, 0.75
@@ -43,7 +43,7 @@ class HenyeyGreenstein(PhaseFunction):
         return (1.0 - g * g) / (4.0 * jnp.pi * denominator * jnp.sqrt(denominator))
 
     def sample(self, wi: Vector, u1: Array, u2: Array) -> Vector:
-        return deflected(wi, *self.deflection(u1), 2.0 * jnp.pi * u2)
+        return deflect(wi, *self.deflection(u1), 2.0 * jnp.pi * u2)
 
     def deflection(self, u: Array) -> tuple[Array, Array]:
         return henyey_greenstein_inverse(self.g, 2.0 * u - 1.0)
@@ -59,7 +59,7 @@ class HenyeyGreenstein(PhaseFunction):
         return _width(self.g, -1.0)
 
     @property
-    def onward_width(self) -> Parameter:
+    def ballistic_width(self) -> Parameter:
         return _width(self.g, 1.0)
 
     @property
@@ -69,6 +69,6 @@ class HenyeyGreenstein(PhaseFunction):
 
 def _width(g: Parameter, side: float) -> Parameter:
     """Of the peak on the side that the sign tells: where p has fallen to about a third."""
-    values, assumed = known_values(g), ASSUMED_FORWARD if side > 0.0 else ASSUMED_BACKWARD
+    values, assumed = concrete_values(g), ASSUMED_FORWARD if side > 0.0 else ASSUMED_BACKWARD
     peaked = np.maximum(assumed if values is None else side * values, 1e-9)
     return np.minimum((1.0 - peaked) / np.sqrt(peaked), 1.0)

@@ -6,7 +6,7 @@ from jax import Array
 
 from layerjax._numerics import safe_sqrt
 from layerjax.directions import Vector, dot
-from layerjax.phase.contract import PhaseFunction, deflected
+from layerjax.phase.contract import PhaseFunction, deflect
 
 
 class Rayleigh(PhaseFunction):
@@ -20,7 +20,7 @@ class Rayleigh(PhaseFunction):
         return 3.0 / (16.0 * jnp.pi) * (1.0 + cosine * cosine)
 
     def sample(self, wi: Vector, u1: Array, u2: Array) -> Vector:
-        return deflected(wi, *self.deflection(u1), 2.0 * jnp.pi * u2)
+        return deflect(wi, *self.deflection(u1), 2.0 * jnp.pi * u2)
 
     def deflection(self, u: Array) -> tuple[Array, Array]:
         # the root of cos^3 + 3 cos = 8 u - 4, which the cumulative distribution asks for

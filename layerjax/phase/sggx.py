@@ -10,7 +10,7 @@ from jax import Array
 
 from layerjax._checks import require_choice
 from layerjax._numerics import safe_div
-from layerjax._parameters import Parameter, floating, is_placeholder, parameter
+from layerjax._parameters import Parameter, as_floating, is_placeholder, parameter
 from layerjax.directions import Vector, half_vector, normalize, reflect, split
 from layerjax.normals.sggx import Kind, radii, sggx_area, sggx_density, sggx_sample
 from layerjax.phase.contract import Flakes, PhaseFunction
@@ -65,17 +65,17 @@ class SGGX(PhaseFunction):
         return self.alpha
 
     @property
-    def is_upright(self) -> bool:
+    def is_axisymmetric(self) -> bool:
         if self.axis is None:
             return True
         return not isinstance(self.axis, jax.core.Tracer) and not np.any(np.asarray(self.axis)[..., :2] != 0.0)
 
-    def simplified(self) -> "SGGX":
-        if self.axis is None or not self.is_upright:
+    def simplify(self) -> "SGGX":
+        if self.axis is None or not self.is_axisymmetric:
             return self
         return eqx.tree_at(lambda phase: phase.axis, self, None)
 
-    def mirrored(self) -> "SGGX":
+    def mirror(self) -> "SGGX":
         if self.axis is None:
             return self
         flip = jnp.asarray([1.0, 1.0, -1.0], jnp.asarray(self.axis).dtype)
@@ -100,11 +100,11 @@ def _axis(axis: Any) -> Any:
     if array.shape[-1:] != (3,):
         raise ValueError(f"SGGX.axis: shape {array.shape} given, (3,) needed (or (..., 3) in a map of stacks)")
     if array.dtype.kind not in "iuf" or isinstance(array, jax.core.Tracer):
-        return floating("SGGX.axis", axis)
+        return as_floating("SGGX.axis", axis)
     concrete = np.asarray(array, float)
     longest = np.abs(concrete).max(axis=-1, keepdims=True)
     bad = ~(np.isfinite(longest) & (longest > 0))[..., 0]
     if bad.any():
         raise ValueError(f"SGGX.axis: {concrete[bad][0].tolist()} is not a finite vector other than zero")
     # whatever its length, it may be needed in single precision
-    return floating("SGGX.axis", axis if np.all((longest > 1e-6) & (longest < 1e6)) else concrete / longest)
+    return as_floating("SGGX.axis", axis if np.all((longest > 1e-6) & (longest < 1e6)) else concrete / longest)

@@ -11,7 +11,7 @@ import numpy as np
 from layerjax import tables
 from layerjax.precompute import NAMES
 
-SHIPPED = Path(tables.__file__).parent
+TABLE_FOLDER = Path(tables.__file__).parent
 
 
 def main() -> None:
@@ -30,7 +30,7 @@ def main() -> None:
     jax.config.update("jax_enable_x64", True)
     module = importlib.import_module(f"layerjax.precompute.{options.name}")
     kept = {} if options.work is None else {"work": options.work}
-    path = write(options.out or SHIPPED, options.name, module.make(coarse=options.coarse, **kept))
+    path = write(options.out or TABLE_FOLDER, options.name, module.make(coarse=options.coarse, **kept))
     print(f"{path}: {path.stat().st_size / 1024:.0f} kB")
 
 

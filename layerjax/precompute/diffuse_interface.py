@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from layerjax.microsurface.energy_tables import LARGEST_INDEX, index_variable
-from layerjax.precompute.interface_walks import multiply_scattered
+from layerjax.precompute.interface_walks import multiple_scattering
 from layerjax.quadrature import gauss_legendre
 from layerjax.transport.statistical import diffuse
 
@@ -190,8 +190,8 @@ def _entering(
 ) -> np.ndarray:
     """T01 (..., tau) where nothing is interpolated but the shares of the walks."""
     c, a, ratio = (x.ravel() for x in np.broadcast_arrays(cosine, alpha, n))
-    _, through, lost = _once(c, a, ratio, size["facets"])
-    total = through + lost[:, None] * _shared(shares, 1, c, a, ratio)
+    _, through, lost = _single_scattering(c, a, ratio, size["facets"])
+    total = through + lost[:, None] * _walk_shares(shares, 1, c, a, ratio)
     return total.reshape(*np.broadcast_shapes(np.shape(cosine), np.shape(alpha), np.shape(n)), len(TAUS))
 
 
@@ -202,12 +202,12 @@ def _returned(alpha: np.ndarray, n: float, size: dict[str, Any], shares: np.ndar
     cosine, weight = _panels(np.asarray([0.0, critical, 1.0]), size["facets"])
     cosine = np.maximum(cosine, 1e-6)  # the first panel may be empty
     c, a, r = (x.ravel() for x in np.broadcast_arrays(cosine[:, None], alpha, ratio))
-    back, _, lost = _once(c, a, r, size["facets"])
-    energy = (back + lost[:, None] * _shared(shares, 0, c, a, r)).reshape(len(cosine), len(alpha), -1)
+    back, _, lost = _single_scattering(c, a, r, size["facets"])
+    energy = (back + lost[:, None] * _walk_shares(shares, 0, c, a, r)).reshape(len(cosine), len(alpha), -1)
     return np.einsum("c,ct,cat->at", 2.0 * weight * cosine, TAUS ** (1.0 / cosine[:, None]), energy)
 
 
-def _once(
+def _single_scattering(
     cosine: np.ndarray, alpha: np.ndarray, n: np.ndarray, nodes: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Light that leaves after one collision, reflected and transmitted (points, tau), and what does not (points,).
@@ -280,12 +280,12 @@ def _walks(size: dict[str, Any], report: Callable[[str], Any]) -> np.ndarray:
         points = np.stack(np.broadcast_arrays(cosine[:, None], alpha[:, None], n), axis=-1)
         flat = jnp.asarray(points.reshape(-1, 3), jnp.float32)
         keys = jax.random.split(jax.random.fold_in(jax.random.key(SEED), side), len(flat))
-        found = np.asarray(multiply_scattered(flat, keys, TAUS, size["paths"]), float)
+        found = np.asarray(multiple_scattering(flat, keys, TAUS, size["paths"]), float)
         sides.append(found.reshape(*points.shape[:-1], 2, len(TAUS)))
     return np.stack(sides)
 
 
-def _shared(shares: np.ndarray, way: int, cosine: np.ndarray, alpha: np.ndarray, n: np.ndarray) -> np.ndarray:
+def _walk_shares(shares: np.ndarray, way: int, cosine: np.ndarray, alpha: np.ndarray, n: np.ndarray) -> np.ndarray:
     """Shares of the walks at points (points, tau) on one side of index 1, cubic between the nodes."""
     side = int(np.min(n) < 1.0)
     c, a, i = (jnp.asarray(x) for x in (cosine, alpha, n))

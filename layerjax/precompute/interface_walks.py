@@ -25,7 +25,7 @@ STRATIFIED = 12
 
 
 @partial(jax.jit, static_argnums=3)
-def multiply_scattered(points: Array, keys: Array, taus: Array, paths: int) -> Array:
+def multiple_scattering(points: Array, keys: Array, taus: Array, paths: int) -> Array:
     """Where light ends up that a rough dielectric interface keeps at the first collision, with absorption on the way.
 
     Args:

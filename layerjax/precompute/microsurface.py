@@ -28,7 +28,7 @@ FACETS = 200
 """Facets that walks meet at most; between nearly equal indices light passes many."""
 ENOUGH = 2e-4
 """Walks end when no more than this is left on any surface."""
-LANES = 1 << 17
+BATCH_PATHS = 1 << 17
 RIDGE = 0.1
 """Prior precision of a coefficient, in units of the inverse error of a walk's answer."""
 
@@ -72,7 +72,7 @@ def _fit(
 ) -> tuple[np.ndarray, float]:
     """Coefficients, and the residual of the energies that they give."""
     key = jax.random.fold_in(jax.random.key(SEED), number)
-    batch = LANES // paths
+    batch = BATCH_PATHS // paths
     rows = []
     for start in range(0, arguments[0].size, batch):
         few = [jnp.asarray(argument[start : start + batch]) for argument in arguments]

@@ -17,12 +17,12 @@ from jax import Array
 from layerjax import fresnel
 from layerjax.microsurface import directional_albedo as by_quadrature
 from layerjax.microsurface.energy_tables import LARGEST_INDEX, LEAST_ALPHA
-from layerjax.microsurface.splines import fitted
-from layerjax.microsurface.visible_facets import cone, facets_in, facets_split, make_cap, refracting
-from layerjax.precompute.energies import LEAST_COSINE, Values, all_facets, batched, dielectric_grid
+from layerjax.microsurface.splines import fit_splines
+from layerjax.microsurface.visible_facets import cone, make_cap, refraction_region, region_facets, split_facets
+from layerjax.precompute.energies import LEAST_COSINE, Values, all_facets, dielectric_grid, map_batches
 from layerjax.quadrature import panels
 from layerjax.transport.statistical.diffuse import GRAIN
-from layerjax.transport.statistical.streams import ENTERING, INTERFACES, STREAMS, packed, polynomials
+from layerjax.transport.statistical.streams import ENTERING, INTERFACES, STREAMS, pack, polynomials
 
 POINTS = 16
 """Nodes from pole to rim of the cap of facets."""
@@ -56,7 +56,7 @@ def make(coarse: bool = False, report: Callable[[str], Any] = print) -> dict[str
 
 
 def interfaces(dense: float) -> Values:
-    """Coefficients of the entries of `streams.packed`, one after the other."""
+    """Coefficients of the entries of `streams.pack`, one after the other."""
     x, y = (np.linspace(0.0, 1.0, int(dense * count)) for count in INTERFACES)
     alpha = np.clip(GRAIN * np.sinh(x * np.arcsinh(1.0 / GRAIN)), LEAST_ALPHA, 1.0)[:, None]
     ior = np.exp(np.log(LARGEST_INDEX) * y**3)[None, :]
@@ -69,8 +69,8 @@ def interfaces(dense: float) -> Values:
         0.5 * (side.back + np.swapaxes(side.back, -1, -2)) + _product(side.returned, side.returned)
         for side in (inward, outward)
     ]
-    values = packed(first + _product(outward.later, inward.later), *symmetric)
-    return np.concatenate([fitted(values[..., k], INTERFACES).ravel() for k in range(values.shape[-1])])
+    values = pack(first + _product(outward.later, inward.later), *symmetric)
+    return np.concatenate([fit_splines(values[..., k], INTERFACES).ravel() for k in range(values.shape[-1])])
 
 
 def _product(out: Values, into: Values) -> Values:
@@ -86,7 +86,7 @@ def diffuse_moments(alpha: Values, ior: Values) -> Moments:
     cosine, weight = (np.asarray(part) for part in panels(jnp.asarray(edges), COSINES))
     cosine = np.clip(cosine, LEAST_COSINE, 1.0)
     arguments = np.broadcast_arrays(cosine, alpha[..., None], ior[..., None])
-    found = Moments(*batched(_moments, *arguments))
+    found = Moments(*map_batches(_moments, *arguments))
     into = 2.0 * (weight * cosine)[..., None] * np.asarray(polynomials(cosine))
     through, back = (np.swapaxes(part, -1, -2) @ into for part in (found.through, found.back))
     later, returned = ((part[..., None, :] @ into)[..., 0, :] for part in (found.later, found.returned))
@@ -97,25 +97,25 @@ def entering(side: str, dense: float) -> list[Values]:
     """Columns of coefficients of the moments of light that enters, over the share that does, for a side of 1."""
     shape = ENTERING[side]
     cosine, alpha, ior = dielectric_grid(side, shape, dense)
-    found = Moments(*batched(_moments, cosine, alpha, ior))
+    found = Moments(*map_batches(_moments, cosine, alpha, ior))
     leaving = diffuse_moments(alpha[0], 1.0 / ior[0]).later
     sums = found.through + found.later[..., None] * leaving / (leaving[..., :1] + LEAST_REST)
     share = sums[..., 1:] / (sums[..., :1] + LEAST_ENTERING)
-    return [fitted(share[..., k], shape).ravel() for k in range(STREAMS - 1)]
+    return [fit_splines(share[..., k], shape).ravel() for k in range(STREAMS - 1)]
 
 
 def _moments(cosine: Array, alpha: Array, ior: Array) -> Moments:
     """The same of light along directions (n,)."""
     cap = make_cap(cosine, alpha)
     index = ior[..., None, None]
-    passing = facets_in(cap, refracting(cap, ior), POINTS)
-    inside = passing.refracted(index)
+    passing = region_facets(cap, refraction_region(cap, ior), POINTS)
+    inside = passing.refracted_cosine(index)
     through = (1.0 - fresnel.dielectric(passing.facing, index)) * by_quadrature.masking(inside, passing.alpha)
-    upper = facets_split(cap, cone(cap, jnp.ones_like(cosine)), refracting(cap, ior), POINTS)
-    back = fresnel.dielectric(upper.facing, index) * by_quadrature.masking(upper.reflected(), upper.alpha)
+    upper = split_facets(cap, cone(cap, jnp.ones_like(cosine)), refraction_region(cap, ior), POINTS)
+    back = fresnel.dielectric(upper.facing, index) * by_quadrature.masking(upper.reflected_cosine(), upper.alpha)
     reflectance = all_facets(cosine, alpha, ior)[0]
     sums = []
-    for facets, way, share in ((passing, inside, through), (upper, upper.reflected(), back)):
+    for facets, way, share in ((passing, inside, through), (upper, upper.reflected_cosine(), back)):
         values = polynomials(jnp.clip(way, 0.0, 1.0))
         sums.append(jnp.stack([facets.mean(share * values[..., k]) for k in range(STREAMS)], axis=-1))
     later, returned = 1.0 - reflectance - sums[0][..., 0], reflectance - sums[1][..., 0]

@@ -4,12 +4,12 @@ import abc
 
 from jax import Array
 
-from layerjax._shown import Shown
+from layerjax._repr import ReprModule
 from layerjax.directions import Vector
 from layerjax.quadrature import Nodes, hemisphere_rule
 
 
-class Surface(Shown):
+class Surface(ReprModule):
     """An opaque surface, lit and seen from above.
 
     Directions come as components (see `layerjax.directions`); callers guarantee that their z is positive. Values are

@@ -5,7 +5,7 @@ from jax import Array
 
 from layerjax import fresnel
 from layerjax._parameters import Parameter, parameter
-from layerjax.channels import each, per_channel
+from layerjax.channels import map_channels, per_channel
 from layerjax.directions import Vector, half_vector, reflect
 from layerjax.normals import facets
 from layerjax.normals.facets import Distribution, check_facets, reflection_pdf
@@ -41,7 +41,7 @@ class Conductor(Surface):
         h, cosine = half_vector(wi, wo, same_side=True)
         lobe = mirror_lobe(h, wi, wo, self.alpha, self.distribution)
         ior, k = per_channel(self.ior), per_channel(self.k)
-        return each(lambda ior, k: lobe * fresnel.conductor(cosine, ior, k), ior, k)
+        return map_channels(lambda ior, k: lobe * fresnel.conductor(cosine, ior, k), ior, k)
 
     def sample(self, wi: Vector, u1: Array, u2: Array) -> Vector:
         return reflect(wi, facets.sample(wi, self.alpha, u1, u2, self.distribution))
@@ -63,6 +63,6 @@ def visibility(
     cosine_i: Array, wi: Vector, cosine_o: Array, wo: Vector, alpha: Array, distribution: Distribution
 ) -> Array:
     """G1(i) G1(o) / (4 cos cos) of two directions and their cosines, >= 0; no cosine is left to divide by."""
-    seen_i = facets.twice_seen(cosine_i, wi, alpha, distribution)
-    seen_o = facets.twice_seen(cosine_o, wo, alpha, distribution)
+    seen_i = facets.twice_projected_area(cosine_i, wi, alpha, distribution)
+    seen_o = facets.twice_projected_area(cosine_o, wo, alpha, distribution)
     return 1.0 / (seen_i * seen_o)

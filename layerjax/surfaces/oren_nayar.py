@@ -12,7 +12,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jax import Array
 
-from layerjax._numerics import at_least, safe_sqrt
+from layerjax._numerics import clamp_min, safe_sqrt
 from layerjax._parameters import Parameter, parameter
 from layerjax.channels import per_channel
 from layerjax.directions import Vector
@@ -75,14 +75,14 @@ class OrenNayar(Surface):
         a = 1.0 - 0.5 * variance / (variance + 0.33)
         b = 0.45 * variance / (variance + 0.09)
         s = wi[0] * wo[0] + wi[1] * wo[1]  # sin sin cos(phi_i - phi_o)
-        shape = (a + b * at_least(s, 0.0) / at_least(wi[2], wo[2])) / jnp.pi
+        shape = (a + b * clamp_min(s, 0.0) / clamp_min(wi[2], wo[2])) / jnp.pi
         return tuple(albedo * shape for albedo in per_channel(self.albedo))
 
     def _energy_preserving(self, wi: Vector, wo: Vector) -> tuple[Array, ...]:
         r = self.roughness
         a = 1.0 / (1.0 + _FUJII * r)  # A_F
         s = wi[0] * wo[0] + wi[1] * wo[1]
-        t = jnp.where(s > 0, at_least(wi[2], wo[2]), 1.0)
+        t = jnp.where(s > 0, clamp_min(wi[2], wo[2]), 1.0)
         single = a * (1.0 + r * s / t) / jnp.pi
         # energy lost by one bounce is a r (c1 - G/pi), and on average a r (c1 - c2): their common factor cancels
         multiple = a * r * (_FUJII - _albedo_term(wi)) * (_FUJII - _albedo_term(wo)) / (_FUJII - _MEAN) / jnp.pi

@@ -14,14 +14,14 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from layerjax._batching import in_chunks, room
+from layerjax._batching import chunk_factor, map_direction_chunks
 from layerjax._checks import require_key
 from layerjax._numerics import safe_div
 from layerjax.channels import Channels, pick
 from layerjax.directions import UNIT_SLACK, Vector, dot, horizontal, select, split
 from layerjax.stack import Interface, Stack
 from layerjax.surfaces import Conductor
-from layerjax.transport.known_directions import Known
+from layerjax.transport.known_directions import DirectionLookup
 
 Side = Literal["all", "reflection", "transmission"]
 """Requested pairs: any; both directions above; one above and one below. Others give 0."""
@@ -40,22 +40,23 @@ class Transport(eqx.Module):
     Directions are components that are broadcast against each other; results are one array per channel. `state` is what
     `prepare` returned: a pytree of arrays with everything that does not depend on direction.
 
-    `measured`, `drawn` and `energies` take whole batches instead, arrays ``(..., 3)``, with a `key` that `needed` made
-    of the user's. They are defined by the two subclasses for deterministic and random transports.
+    `evaluate_batch`, `sample_batch` and `albedo_batch` take whole batches instead, arrays ``(..., 3)``, with a `key`
+    that `resolve_key` made of the user's. They are defined by the two subclasses for deterministic and random
+    transports.
     """
 
     random: ClassVar[bool]
     """Whether values are drawn at random, with a key."""
 
-    uses_known: ClassVar[bool] = False
-    """Whether `prepare_for` makes use of known directions."""
+    uses_known_directions: ClassVar[bool] = False
+    """Whether `prepare_for_directions` makes use of known directions."""
 
-    side_by_side: ClassVar[int] = 1
+    texel_batch: ClassVar[int] = 1
     """How many texels of a map of stacks are computed together; `TEXELS` for stacks of a few numbers."""
 
-    def together(self, stack: Stack) -> int:
+    def texel_batch_size(self, stack: Stack) -> int:
         """How many texels of a map of this (simplified) stack are computed together."""
-        return self.side_by_side
+        return self.texel_batch
 
     @abc.abstractmethod
     def check(self, stack: Stack, names: Sequence[str]) -> None:
@@ -68,26 +69,26 @@ class Transport(eqx.Module):
     def prepare(self, stack: Stack) -> Any:
         """Precompute everything that does not depend on direction, for a simplified stack."""
 
-    def chosen_for(self, stack: Stack, known: Known) -> "Transport":
+    def resolve_options(self, stack: Stack, known: DirectionLookup) -> "Transport":
         """The same transport, with open options chosen for a simplified stack and known directions."""
         return self
 
-    def chosen_for_energies(self, stack: Stack) -> "Transport":
-        """Like `chosen_for`, for energies only, for which narrow lobes do not need a finer resolution."""
-        return self.chosen_for(stack, lambda: None)
+    def resolve_options_for_albedo(self, stack: Stack) -> "Transport":
+        """Like `resolve_options`, for energies only, for which narrow lobes do not need a finer resolution."""
+        return self.resolve_options(stack, lambda: None)
 
-    def prepare_for(self, stack: Stack, known: Known) -> Any:
+    def prepare_for_directions(self, stack: Stack, known: DirectionLookup) -> Any:
         """Like `prepare`, for values at known directions only."""
         return self.prepare(stack)
 
-    def for_tracing(self, stack: Stack, known: Known) -> "Transport | None":
+    def traceable_equivalent(self, stack: Stack, known: DirectionLookup) -> "Transport | None":
         """A transport with the same values, and with forward derivatives, inside a program where all parameters of the
         simplified stack are traced; None if there is none. Directions are known, and so is the stack except for the
         parameters by which it is differentiated."""
         return None
 
-    def prepare_energies(self, stack: Stack) -> Any:
-        """Like `prepare`, for `energies` only."""
+    def prepare_for_albedo(self, stack: Stack) -> Any:
+        """Like `prepare`, for `albedo_batch` only."""
         return self.prepare(stack)
 
     @abc.abstractmethod
@@ -99,29 +100,29 @@ class Transport(eqx.Module):
         """Density of `sample` in solid angle, 1/sr."""
 
     @abc.abstractmethod
-    def needed(self, key: Array | None, function: str) -> Array | None:
+    def resolve_key(self, key: Array | None, function: str) -> Array | None:
         """The key, or None for a deterministic transport. ValueError for `function` if it is missing."""
 
     @abc.abstractmethod
-    def compared(self) -> "Sequence[Transport] | None":
-        """Transports for an error estimate; None if `measured` returns errors. ValueError if there is no estimate."""
+    def comparison_transports(self) -> "Sequence[Transport] | None":
+        """Transports for an error estimate; None if `evaluate_batch` returns errors. ValueError: there is none."""
 
     @abc.abstractmethod
-    def measured(
+    def evaluate_batch(
         self, state: Any, wi: Array, wo: Array, side: Side, channels: int, key: Array | None
     ) -> tuple[Array, Array | None]:
         """Values ``(..., C)`` of the BSDF in 1/sr, without the cosine, and their errors, or None."""
 
-    def doubt(self, state: Any, wi: Array, wo: Array, side: Side, channels: int) -> Array | float:
+    def common_error(self, state: Any, wi: Array, wo: Array, side: Side, channels: int) -> Array | float:
         """Further error of values ``(..., C)`` that all resolutions share, for example where they are clamped to 0."""
         return 0.0
 
     @abc.abstractmethod
-    def drawn(self, state: Any, wi: Array, channels: int, key: Array) -> tuple[Array, Array, Array]:
+    def sample_batch(self, state: Any, wi: Array, channels: int, key: Array) -> tuple[Array, Array, Array]:
         """Outgoing directions ``(..., 3)``, their densities ``(...)`` and weights ``(..., C)``."""
 
     @abc.abstractmethod
-    def energies(self, state: Any, wi: Array, channels: int, nodes: int, key: Array | None) -> tuple[Array, Array]:
+    def albedo_batch(self, state: Any, wi: Array, channels: int, nodes: int, key: Array | None) -> tuple[Array, Array]:
         """Scattered energy ``(..., C)`` that leaves on wi's side and on the other, for unit irradiance."""
 
     def coarser(self) -> "Transport | None":
@@ -132,7 +133,7 @@ class Transport(eqx.Module):
         """The same transport at a higher resolution; None if it has none."""
         return None
 
-    def _leaving(self, state: Any, wi: Vector, uniforms: Uniforms) -> tuple[Vector, Array]:
+    def _sample_with_density(self, state: Any, wi: Vector, uniforms: Uniforms) -> tuple[Vector, Array]:
         """Directions drawn, and their densities.
 
         What leaves nowhere may be no unit vector: it becomes a direction in the tangent plane, where the BSDF is 0.
@@ -156,37 +157,37 @@ class DeterministicTransport(Transport):
     def albedo(self, state: Any, wi: Vector, nodes: int) -> tuple[Channels, Channels]:
         """Scattered energy that leaves on wi's side and on the other, for unit irradiance."""
 
-    def needed(self, key: Array | None, function: str) -> None:
+    def resolve_key(self, key: Array | None, function: str) -> None:
         if key is not None:
             require_key(key)
 
-    def compared(self) -> "Sequence[Transport]":
+    def comparison_transports(self) -> "Sequence[Transport]":
         coarser = self.coarser()
         if coarser is None:
             name = type(self).__name__
             raise ValueError(f"transport: {name} has no resolution to vary and no standard error: evaluate_with_error")
         return [coarser]
 
-    def measured(
+    def evaluate_batch(
         self, state: Any, wi: Array, wo: Array, side: Side, channels: int, key: Array | None
     ) -> tuple[Array, None]:
         def values(wi: Vector, wo: Vector) -> Channels:
             found = self.evaluate(state, wi, wo, side)
             return tuple(pick(found, c) for c in range(channels))
 
-        return in_chunks(values, wi, wo), None
+        return map_direction_chunks(values, wi, wo), None
 
-    def drawn(self, state: Any, wi: Array, channels: int, key: Array) -> tuple[Array, Array, Array]:
+    def sample_batch(self, state: Any, wi: Array, channels: int, key: Array) -> tuple[Array, Array, Array]:
         def draw(wi: Vector, uniforms: Vector) -> tuple[Array, ...]:
-            wo, density = self._leaving(state, wi, uniforms)
+            wo, density = self._sample_with_density(state, wi, uniforms)
             values = self.evaluate(state, wi, wo, "all")
             weights = [safe_div(pick(values, c) * jnp.abs(wo[2]), density) for c in range(channels)]
             return (*wo, density, *weights)
 
-        found = in_chunks(draw, wi, jax.random.uniform(key, wi.shape, dtype=wi.dtype))
+        found = map_direction_chunks(draw, wi, jax.random.uniform(key, wi.shape, dtype=wi.dtype))
         return found[..., :3], found[..., 3], found[..., 4:]
 
-    def energies(self, state: Any, wi: Array, channels: int, nodes: int, key: Array | None) -> tuple[Array, Array]:
+    def albedo_batch(self, state: Any, wi: Array, channels: int, nodes: int, key: Array | None) -> tuple[Array, Array]:
         def one(wi: Array) -> tuple[Array, Array]:
             sides = self.albedo(state, split(wi), nodes)
             near, far = (jnp.stack([pick(side, c) for c in range(channels)], axis=-1) for side in sides)
@@ -195,7 +196,7 @@ class DeterministicTransport(Transport):
         batch = wi.shape[:-1]
         if 0 in batch:
             return (jnp.zeros((*batch, channels), wi.dtype),) * 2
-        near, far = jax.lax.map(one, wi.reshape(-1, 3), batch_size=room() if room() > 1 else None)
+        near, far = jax.lax.map(one, wi.reshape(-1, 3), batch_size=chunk_factor() if chunk_factor() > 1 else None)
         return near.reshape(*batch, -1), far.reshape(*batch, -1)
 
 
@@ -214,17 +215,17 @@ class RandomTransport(Transport):
     def estimate_albedo(self, state: Any, wi: Vector, channels: int, key: Array) -> tuple[Array, Array]:
         """Shares scattered to wi's side, then to the other, and standard errors: (n, 2 channels) each."""
 
-    def needed(self, key: Array | None, function: str) -> Array:
+    def resolve_key(self, key: Array | None, function: str) -> Array:
         if key is None:
             name = type(self).__name__
             raise ValueError(f"key: {name} draws random numbers: {function}(..., key=jax.random.key(seed))")
         require_key(key)
         return key
 
-    def compared(self) -> None:
+    def comparison_transports(self) -> None:
         return None
 
-    def measured(
+    def evaluate_batch(
         self, state: Any, wi: Array, wo: Array, side: Side, channels: int, key: Array | None
     ) -> tuple[Array, Array]:
         batch = jnp.broadcast_shapes(wi.shape, wo.shape)[:-1]
@@ -235,17 +236,17 @@ class RandomTransport(Transport):
         values, errors = self.estimate(state, i, o, side, channels, key)
         return values.reshape(*batch, -1), errors.reshape(*batch, -1)
 
-    def drawn(self, state: Any, wi: Array, channels: int, key: Array) -> tuple[Array, Array, Array]:
+    def sample_batch(self, state: Any, wi: Array, channels: int, key: Array) -> tuple[Array, Array, Array]:
         def draw(wi: Vector, uniforms: Vector) -> tuple[Array, ...]:
-            wo, density = self._leaving(state, wi, uniforms)
+            wo, density = self._sample_with_density(state, wi, uniforms)
             return (*wo, density)
 
-        found = in_chunks(draw, wi, jax.random.uniform(key, wi.shape, dtype=wi.dtype))
+        found = map_direction_chunks(draw, wi, jax.random.uniform(key, wi.shape, dtype=wi.dtype))
         wo, density = found[..., :3], found[..., 3]
-        values, _ = self.measured(state, wi, wo, "all", channels, jax.random.fold_in(key, 1))
+        values, _ = self.evaluate_batch(state, wi, wo, "all", channels, jax.random.fold_in(key, 1))
         return wo, density, safe_div(values * jnp.abs(wo[..., 2:]), density[..., None])
 
-    def energies(self, state: Any, wi: Array, channels: int, nodes: int, key: Array | None) -> tuple[Array, Array]:
+    def albedo_batch(self, state: Any, wi: Array, channels: int, nodes: int, key: Array | None) -> tuple[Array, Array]:
         batch = wi.shape[:-1]
         if 0 in batch:
             return (jnp.zeros((*batch, channels), wi.dtype),) * 2

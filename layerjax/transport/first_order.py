@@ -14,8 +14,8 @@ from jax import Array
 
 from layerjax._numerics import horizon, one_minus_exp
 from layerjax._parameters import Parameter
-from layerjax.channels import Channels, each, total
-from layerjax.directions import Vector, flip, half_vector, reflect, sanitised, select
+from layerjax.channels import Channels, map_channels, total
+from layerjax.directions import Vector, flip, half_vector, reflect, sanitise, select
 from layerjax.normals.facets import Distribution, reflection_pdf, rule, sample
 from layerjax.quadrature import Nodes
 from layerjax.stack import Interface, Medium, Stack, optical_depths
@@ -79,7 +79,7 @@ def first_order(stack: Stack) -> FirstOrder:
     bottom = stack.layers[last]
     assert isinstance(bottom, Interface)
     lower = Media(
-        tuple(map(_flipped, reversed(_media(stack.layers[last + 1 :])))),
+        tuple(map(_flip_medium, reversed(_media(stack.layers[last + 1 :])))),
         ReflectingInterface(above / bottom.ior, bottom.alpha, bottom.distribution),
     )
     crossing = ReflectingInterface(face.ior, face.alpha, face.distribution) if first == last else None
@@ -97,28 +97,28 @@ def evaluate_first(state: FirstOrder, wi: Vector, wo: Vector, side: Side) -> Cha
     if side == "all" and state.lower is not None:
         parts.append(single.evaluate(state.lower, flip(wi), flip(wo), "reflection"))
     if side != "reflection" and state.crossing is not None:
-        parts.append(_refracted(state, state.crossing, wi, wo))
+        parts.append(_refraction(state, state.crossing, wi, wo))
     zero = jnp.zeros_like(wi[2] * wo[2])
     return total(parts, zero)
 
 
 def interaction_probability(state: FirstOrder, w: Vector) -> Channels | None:
-    """Probability that light along w meets an event at all, per channel; None: it is 1. See `colliding_share`."""
+    """Probability that light along w meets an event at all, per channel; None: it is 1. See `collision_probability`."""
     if state.layered or state.opaque:
         return None
-    return colliding_share(state.upper.media, sanitised(w, jnp.abs(w[2]) > horizon(w[2].dtype)))
+    return collision_probability(state.upper.media, sanitise(w, jnp.abs(w[2]) > horizon(w[2].dtype)))
 
 
-def onward_probability(state: FirstOrder, scaled: FirstOrder, w: Vector) -> Channels | None:
+def peak_probability(state: FirstOrder, scaled: FirstOrder, w: Vector) -> Channels | None:
     """Probability that light passes the scaled media without a collision, but not the others; None: it is 0."""
     if state.layered or state.opaque:
         return None
-    w = sanitised(w, jnp.abs(w[2]) > horizon(w[2].dtype))
+    w = sanitise(w, jnp.abs(w[2]) > horizon(w[2].dtype))
     whole, less = (total(optical_depths(one.upper.media, w), jnp.zeros_like(w[2])) for one in (state, scaled))
-    return each(lambda whole, less: jnp.exp(-less) * one_minus_exp(whole - less), whole, less)
+    return map_channels(lambda whole, less: jnp.exp(-less) * one_minus_exp(whole - less), whole, less)
 
 
-def colliding_share(media: Sequence[Medium], w: Vector) -> Channels:
+def collision_probability(media: Sequence[Medium], w: Vector) -> Channels:
     """Share of light along w that collides in media, 1 - exp(-depth), per channel.
 
     In media of thickness 0 it is what that is in proportion to: quantities that vanish with it are interpolated as
@@ -128,13 +128,13 @@ def colliding_share(media: Sequence[Medium], w: Vector) -> Channels:
     return tuple(jnp.where(depth > 0, one_minus_exp(depth), 1.0 / jnp.abs(w[2])) for depth in depths)
 
 
-def _refracted(state: FirstOrder, face: ReflectingInterface, wi: Vector, wo: Vector) -> Channels:
+def _refraction(state: FirstOrder, face: ReflectingInterface, wi: Vector, wo: Vector) -> Channels:
     assert state.lower is not None
     downward = wi[2] > 0
     over, under = select(downward, wi, wo), select(downward, wo, wi)
     edge = horizon(wi[2].dtype)
     valid = (over[2] > edge) & (under[2] < -edge)
-    over = sanitised(over, valid)
+    over = sanitise(over, valid)
     under = (under[0], under[1], jnp.where(valid, under[2], -0.5))
     value = interface_transmission(over, under, face.ior, face.alpha, face.distribution)
     value = jnp.where(downward, value, value / (face.ior * face.ior))  # f / ior_o^2 is reciprocal
@@ -146,6 +146,6 @@ def _media(layers: tuple[Interface | Medium, ...]) -> tuple[Medium, ...]:
     return tuple(layer for layer in layers if isinstance(layer, Medium))
 
 
-def _flipped(medium: Medium) -> Medium:
-    phase = medium.phase.mirrored()
+def _flip_medium(medium: Medium) -> Medium:
+    phase = medium.phase.mirror()
     return medium if phase is medium.phase else eqx.tree_at(lambda m: m.phase, medium, phase)

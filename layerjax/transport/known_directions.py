@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from layerjax._numerics import at_most, horizon
+from layerjax._numerics import clamp_max, horizon
 
 MOST_COSINES = 256
 """Nothing is gained by knowing more distinct cosines than these on a side."""
@@ -28,19 +28,19 @@ STAND_IN = 0.5
 class KnownDirections(eqx.Module):
     """The distinct cosines among the directions of a batch.
 
-    above, below: |cosine|, (cosines,) each. of_wi, of_wo: for every direction the place of its cosine among those above
-    and then those below; the shapes of wi and wo without the last axis. all_above: whether it is known that none lies
-    below.
+    above, below: |cosine|, (cosines,) each. wi_index, wo_index: for every direction the place of its cosine among
+    those above and then those below; the shapes of wi and wo without the last axis. all_above: whether it is known that
+    none lies below.
     """
 
     above: Array
     below: Array
-    of_wi: Array
-    of_wo: Array
+    wi_index: Array
+    wo_index: Array
     all_above: bool = eqx.field(static=True, default=False)
 
 
-Known = Callable[[], KnownDirections | None]
+DirectionLookup = Callable[[], KnownDirections | None]
 """Looks at the directions of a batch when it is called: whom they are of no use need not pay for it."""
 
 
@@ -62,8 +62,8 @@ def known_directions(wi: Any, wo: Any) -> KnownDirections | None:
     if max(values.size for values in sides) > MOST_COSINES:
         return None
     split = cosines[0].size
-    of_wi, of_wo = places[:split].reshape(cosines[0].shape), places[split:].reshape(cosines[1].shape)
-    above, below, i, o = map(jnp.asarray, (*sides, of_wi, of_wo))
+    wi_index, wo_index = places[:split].reshape(cosines[0].shape), places[split:].reshape(cosines[1].shape)
+    above, below, i, o = map(jnp.asarray, (*sides, wi_index, wo_index))
     return KnownDirections(above, below, i, o, all_above=bool(np.all(z > 0)))
 
 
@@ -72,10 +72,10 @@ def known_above(*directions: Any) -> bool:
     return all(not isinstance(w, jax.core.Tracer) and bool(np.all(np.asarray(w)[..., 2] > 0)) for w in directions)
 
 
-def own_cosines(wi: Array, wo: Array, all_above: bool) -> KnownDirections:
+def separate_cosines(wi: Array, wo: Array, all_above: bool) -> KnownDirections:
     """Directions (n, 3) each, known or traced, as if each had a cosine of its own: of few pairs that is as good."""
     z = jnp.concatenate([wi[:, 2], wo[:, 2]])
-    size = jnp.where(jnp.abs(z) > horizon(z.dtype), at_most(jnp.abs(z), 1.0), STAND_IN)
+    size = jnp.where(jnp.abs(z) > horizon(z.dtype), clamp_max(jnp.abs(z), 1.0), STAND_IN)
     place = jnp.arange(z.size) + jnp.where(z > 0, 0, z.size)
     above, below = (jnp.where(side, size, STAND_IN) for side in (z > 0, z <= 0))
     return KnownDirections(above, below, place[: z.size // 2], place[z.size // 2 :], all_above)

@@ -19,9 +19,9 @@ import jax.numpy as jnp
 from jax import Array
 
 from layerjax import channels, fresnel
-from layerjax._numerics import absorb, at_least, decay_between, horizon, one_minus_exp, safe_div
-from layerjax.channels import Channels, count, each, largest, mean, per_channel, pick, times, total
-from layerjax.directions import Vector, half_vector, is_above, sanitised, select
+from layerjax._numerics import absorb, clamp_min, horizon, mean_decay, one_minus_exp, safe_div
+from layerjax.channels import Channels, count, largest, map_channels, mean, multiply, per_channel, pick, total
+from layerjax.directions import Vector, half_vector, is_above, sanitise, select
 from layerjax.quadrature import Nodes
 from layerjax.stack import Interface, Medium, Stack, is_known, media_of, optical_depths
 from layerjax.surfaces import Surface
@@ -48,7 +48,7 @@ class SingleScattering(DeterministicTransport):
     inter-reflection.
     """
 
-    side_by_side: ClassVar[int] = TEXELS
+    texel_batch: ClassVar[int] = TEXELS
 
     def check(self, stack: Stack, names: Sequence[str]) -> None:
         for name, layer in zip(names, stack.layers, strict=True):
@@ -73,19 +73,19 @@ class SingleScattering(DeterministicTransport):
     def albedo(self, state: Media, wi: Vector, nodes: int) -> tuple[Channels, Channels]:
         near, far = [], []
         spread: Vector = (wi[0][..., None], wi[1][..., None], wi[2][..., None])
-        for index in _scattering(state):
+        for index in _scattering_indices(state):
             same_side, other_side = state.media[index].phase.rule(wi, nodes)
             near.append(_integral(layer_lobes(state, spread, same_side[0], "all")[index], same_side))
             if state.base is None:
                 far.append(_integral(layer_lobes(state, spread, other_side[0], "all")[index], other_side))
         if state.base is not None:
-            upper = state.base.rule(sanitised(wi), nodes)
+            upper = state.base.rule(sanitise(wi), nodes)
             near.append(_integral(layer_lobes(state, spread, upper[0], "reflection")[BASE], upper))
         zero = jnp.zeros_like(wi[2])
         return total(near, zero), total(far, zero)
 
 
-def _scattering(slab: Media) -> list[int]:
+def _scattering_indices(slab: Media) -> list[int]:
     """Indices of the media that scatter at all."""
     return [k for k, medium in enumerate(slab.media) if not is_known(medium.albedo, 0.0)]
 
@@ -97,11 +97,11 @@ def layer_lobes(slab: Media, wi: Vector, wo: Vector, side: Side) -> dict[int, Ch
         return {}
     valid = is_valid_pair(wi, wo, side, opaque)
     if opaque or side == "reflection":
-        lobes = _from_above(slab, sanitised(wi), sanitised(wo))
+        lobes = _lobes_from_above(slab, sanitise(wi), sanitise(wo))
     else:
         edge = horizon(wi[2].dtype)
-        inside_i, inside_o = (sanitised(w, jnp.abs(w[2]) > edge) for w in (wi, wo))
-        lobes = _from_any_side(slab, inside_i, inside_o, side)
+        inside_i, inside_o = (sanitise(w, jnp.abs(w[2]) > edge) for w in (wi, wo))
+        lobes = _lobes_from_any_side(slab, inside_i, inside_o, side)
     return {k: channels.select(valid, lobe) for k, lobe in lobes.items()}
 
 
@@ -114,36 +114,36 @@ def is_valid_pair(wi: Vector, wo: Vector, side: Side, opaque: bool) -> Array:
     return valid & (wi[2] * wo[2] < 0) if side == "transmission" else valid
 
 
-def _from_above(slab: Media, wi: Vector, wo: Vector) -> dict[int, Channels]:
+def _lobes_from_above(slab: Media, wi: Vector, wo: Vector) -> dict[int, Channels]:
     """wi and wo above: each layer is seen through those over it, exp(-sum (a_j + b_j)), as a running product."""
     if not slab.media:
         return {} if slab.base is None else {BASE: slab.base.evaluate(wi, wo)}
     lobes: dict[int, Channels] = {}
-    scattering = _scattering(slab)
+    scattering = _scattering_indices(slab)
     last = len(slab.media) - 1
     half = half_vector(wi, wo, same_side=True) if _uses_half_vector(slab) else None
     inverse = 1.0 / (wi[2] * wo[2])
     through: Channels | None = None
     for k, medium in enumerate(slab.media):
         weight = medium.phase.cross_section(wi) * wo[2] + medium.phase.cross_section(wo) * wi[2]
-        weight = at_least(weight, WEIGHT_FLOOR)
+        weight = clamp_min(weight, WEIGHT_FLOOR)
         # exp(-x) and 1 - exp(-x) of Eq. (12): x = tau (sigma_i/c_i + sigma_o/c_o)
         shares = [absorb(tau * (weight * inverse)) for tau in per_channel(medium.thickness)]
         if k in scattering:
             lost = tuple(share / weight for _, share in shares)  # G / (c_i c_o), Eqs. (11) and (12)
-            lobes[k] = times(_collision(medium, wi, wo, half), lost if through is None else times(through, lost))
+            lobes[k] = multiply(_collision(medium, wi, wo, half), lost if through is None else multiply(through, lost))
         if k < last or slab.base is not None:
             transmitted = tuple(share for share, _ in shares)
-            through = transmitted if through is None else times(through, transmitted)
+            through = transmitted if through is None else multiply(through, transmitted)
     if slab.base is not None and through is not None:
-        lobes[BASE] = times(through, slab.base.evaluate(wi, wo))  # Sec. 4.5
+        lobes[BASE] = multiply(through, slab.base.evaluate(wi, wo))  # Sec. 4.5
     return lobes
 
 
-def _from_any_side(slab: Media, wi: Vector, wo: Vector, side: Side) -> dict[int, Channels]:
+def _lobes_from_any_side(slab: Media, wi: Vector, wo: Vector, side: Side) -> dict[int, Channels]:
     """Any sides, no base: a direction above crosses the layers over k, one below those under it."""
     lobes: dict[int, Channels] = {}
-    scattering = _scattering(slab)
+    scattering = _scattering_indices(slab)
     if not scattering:
         return lobes
     half = half_vector(wi, wo) if _uses_half_vector(slab) else None
@@ -158,12 +158,12 @@ def _from_any_side(slab: Media, wi: Vector, wo: Vector, side: Side) -> dict[int,
         if len(slab.media) > 1:  # Sec. 4.4
             path = path_i + path_o
             into, out = into + path, out + path
-        return thickness * inverse * decay_between(into, out)  # G / (c_i c_o) of Eqs. (12) and (16)
+        return thickness * inverse * mean_decay(into, out)  # G / (c_i c_o) of Eqs. (12) and (16)
 
     for k in scattering:
         medium = slab.media[k]
-        gains = each(gain, per_channel(medium.thickness), depths_i[k], depths_o[k], paths_i[k], paths_o[k])
-        lobes[k] = times(_collision(medium, wi, wo, half), gains)
+        gains = map_channels(gain, per_channel(medium.thickness), depths_i[k], depths_o[k], paths_i[k], paths_o[k])
+        lobes[k] = multiply(_collision(medium, wi, wo, half), gains)
     return lobes
 
 
@@ -182,7 +182,7 @@ def _paths(depths: Sequence[Channels], w: Vector) -> list[Channels]:
 
 def _uses_half_vector(slab: Media) -> bool:
     """Whether any collision needs one: a phase function of flakes does, and so does a Fresnel term."""
-    scattering = (slab.media[k] for k in _scattering(slab))
+    scattering = (slab.media[k] for k in _scattering_indices(slab))
     return any(medium.phase.uses_half_vector or medium.f0 is not None for medium in scattering)
 
 
@@ -192,7 +192,7 @@ def _collision(medium: Medium, wi: Vector, wo: Vector, half: tuple[Vector, Array
     if half is not None and medium.f0 is not None:
         levels = (0.0,) if is_known(medium.f0, 0.0) else per_channel(medium.f0)
         strength = tuple(strength[0] * fresnel.schlick(half[1], f0) for f0 in levels)
-    return strength if is_known(medium.albedo, 1.0) else times(per_channel(medium.albedo), strength)
+    return strength if is_known(medium.albedo, 1.0) else multiply(per_channel(medium.albedo), strength)
 
 
 def choices(slab: Media, wi: Vector) -> list[tuple[Array, Any]]:
@@ -202,13 +202,13 @@ def choices(slab: Media, wi: Vector) -> list[tuple[Array, Any]]:
     """
     edge = horizon(wi[2].dtype)
     valid = wi[2] > edge if slab.base is not None else jnp.abs(wi[2]) > edge
-    wi = sanitised(wi, valid)
+    wi = sanitise(wi, valid)
     depths = optical_depths(slab.media, wi)
     paths = _paths(depths, wi)
     events: list[tuple[Array, Any]] = []
-    for k in _scattering(slab):
+    for k in _scattering_indices(slab):
         medium = slab.media[k]
-        collides = mean(times(tuple(jnp.exp(-path) for path in paths[k]), tuple(map(one_minus_exp, depths[k]))))
+        collides = mean(multiply(tuple(jnp.exp(-path) for path in paths[k]), tuple(map(one_minus_exp, depths[k]))))
         survives = 1.0 if is_known(medium.albedo, 1.0) else largest(per_channel(medium.albedo))
         events.append((collides * survives, medium.phase))
     if slab.base is not None:
@@ -235,10 +235,10 @@ def draw(choices: list[tuple[Array, Any]], wi: Vector, uniforms: tuple[Array, Ar
 def density(choices: list[tuple[Array, Any]], wi: Vector, wo: Vector) -> Array:
     """The density of `draw`, 1/sr."""
     total = jnp.zeros_like(wi[2] * wo[2])
-    off_plane = sanitised(wi, jnp.abs(wi[2]) > horizon(wi[2].dtype))  # of others, zeros too, all probabilities are 0
+    off_plane = sanitise(wi, jnp.abs(wi[2]) > horizon(wi[2].dtype))  # of others, zeros too, all probabilities are 0
     for probability, lobe in choices:
         if isinstance(lobe, Surface):
-            above = jnp.where(is_above(wo), lobe.pdf(sanitised(wi), sanitised(wo)), 0.0)
+            above = jnp.where(is_above(wo), lobe.pdf(sanitise(wi), sanitise(wo)), 0.0)
             total = total + probability * above
         else:
             total = total + probability * lobe.pdf(off_plane, wo)

@@ -21,14 +21,14 @@ import jax.numpy as jnp
 from jax import Array
 
 from layerjax import fresnel
-from layerjax.channels import Channels, each, mean, per_channel, times, total
+from layerjax.channels import Channels, map_channels, mean, multiply, per_channel, total
 from layerjax.directions import (
     Factor,
     Vector,
     combine,
     half_vector,
     is_above,
-    sanitised,
+    sanitise,
     select,
     squared_cosine_of_refraction,
 )
@@ -37,7 +37,7 @@ from layerjax.stack import Medium, Stack, is_known, optical_depths
 from layerjax.surfaces import Conductor, Surface
 from layerjax.transport.contract import TEXELS, DeterministicTransport, Side, refuse_vmf
 from layerjax.transport.first_order import ReflectingInterface
-from layerjax.transport.known_directions import Known
+from layerjax.transport.known_directions import DirectionLookup
 
 LEAST_SHARE = 0.02
 """Added to the energy of every lobe before they are drawn by it: none is missed where its estimate is 0."""
@@ -51,7 +51,7 @@ class WeidlichWilkie(DeterministicTransport):
     with `equinox.tree_at`. The values are reciprocal.
     """
 
-    side_by_side: ClassVar[int] = TEXELS
+    texel_batch: ClassVar[int] = TEXELS
 
     def check(self, stack: Stack, names: Sequence[str]) -> None:
         refuse_vmf(stack, names, "WeidlichWilkie")
@@ -69,7 +69,7 @@ class WeidlichWilkie(DeterministicTransport):
     def prepare(self, stack: Stack) -> Stack:
         return stack
 
-    def for_tracing(self, stack: Stack, known: Known) -> "WeidlichWilkie":
+    def traceable_equivalent(self, stack: Stack, known: DirectionLookup) -> "WeidlichWilkie":
         """Itself: no number decides what is computed."""
         return self
 
@@ -81,7 +81,7 @@ class WeidlichWilkie(DeterministicTransport):
 
     def sample(self, state: Stack, wi: Vector, uniforms: tuple[Array, Array, Array]) -> Vector:
         u, u1, u2 = uniforms
-        wi = sanitised(wi)
+        wi = sanitise(wi)
         choices = _choices(state, wi)
         wo = choices[-1][1].sample(wi, u1, u2)
         edge = jnp.zeros_like(u)
@@ -92,7 +92,7 @@ class WeidlichWilkie(DeterministicTransport):
         return wo
 
     def pdf(self, state: Stack, wi: Vector, wo: Vector) -> Array:
-        safe_i, safe_o = sanitised(wi), sanitised(wo)
+        safe_i, safe_o = sanitise(wi), sanitise(wo)
         density = jnp.zeros_like(wi[2] * wo[2])
         for probability, surface in _choices(state, safe_i):
             density = density + probability * surface.pdf(safe_i, safe_o)
@@ -105,8 +105,8 @@ class WeidlichWilkie(DeterministicTransport):
         """
         spread: Vector = (wi[0][..., None], wi[1][..., None], wi[2][..., None])
         energies: list[Channels] = []
-        for index, (_, surface) in enumerate(_choices(state, sanitised(wi))):
-            wo, weight = surface.rule(sanitised(wi), nodes)
+        for index, (_, surface) in enumerate(_choices(state, sanitise(wi))):
+            wo, weight = surface.rule(sanitise(wi), nodes)
             values = _lobes(state, spread, wo)[index]
             energies.append(tuple(jnp.sum(value * wo[2] * weight, axis=-1) for value in values))
         zero = jnp.zeros_like(wi[2])
@@ -116,7 +116,7 @@ class WeidlichWilkie(DeterministicTransport):
 def _lobes(stack: Stack, wi: Vector, wo: Vector) -> list[Channels]:
     """BRDF of every interface, from top to bottom, and of the base, each as seen from outside."""
     valid = is_above(wi) & is_above(wo)
-    wi, wo = sanitised(wi), sanitised(wo)
+    wi, wo = sanitise(wi), sanitise(wo)
     h, cosine = half_vector(wi, wo, same_side=True)
     lobes: list[Channels] = []
     above: Factor = 1.0
@@ -124,23 +124,23 @@ def _lobes(stack: Stack, wi: Vector, wo: Vector) -> list[Channels]:
     for layer in stack.layers:
         if isinstance(layer, Medium):
             into, out = (optical_depths([layer], w)[0] for w in (wi, wo))
-            through = times(through, tuple(jnp.exp(-(a + b)) for a, b in zip(into, out, strict=True)))  # a
+            through = multiply(through, tuple(jnp.exp(-(a + b)) for a, b in zip(into, out, strict=True)))  # a
             continue
         ior = layer.ior / above
         level = fresnel.dielectric(cosine, ior)
         lobe, masking = _facets(h, wi, wo, layer.alpha)
-        lobes.append(times(through, (level * lobe,)))  # f_1
+        lobes.append(multiply(through, (level * lobe,)))  # f_1
         refracted = 1.0 - level  # T12, T21
-        wi, wo, cosine, inside = _refracted(wi, wo, h, cosine, ior)
+        wi, wo, cosine, inside = _refract_pair(wi, wo, h, cosine, ior)
         # T12 t
-        through = times(through, (jnp.where(inside, refracted * (1.0 - masking + refracted * masking), 0.0),))
+        through = multiply(through, (jnp.where(inside, refracted * (1.0 - masking + refracted * masking), 0.0),))
         above = layer.ior
     assert stack.base is not None
-    lobes.append(times(through, _reflected(stack.base, wi, wo, h, cosine, above)))
+    lobes.append(multiply(through, _base_reflection(stack.base, wi, wo, h, cosine, above)))
     return lobes
 
 
-def _reflected(base: Surface, wi: Vector, wo: Vector, h: Vector, cosine: Array, above: Factor) -> Channels:
+def _base_reflection(base: Surface, wi: Vector, wo: Vector, h: Vector, cosine: Array, above: Factor) -> Channels:
     """BRDF of the base under a medium of that index."""
     if not isinstance(base, Conductor):
         return base.evaluate(wi, wo)
@@ -151,7 +151,7 @@ def _reflected(base: Surface, wi: Vector, wo: Vector, h: Vector, cosine: Array, 
 def _conductor(base: Conductor, cosine: Array, above: Factor) -> Channels:
     """Reflectance of a conductor whose index is counted from what surrounds the stack, under a medium of that index."""
     ior, k = per_channel(base.ior), per_channel(base.k)
-    return each(lambda ior, k: fresnel.conductor(cosine, ior / above, k / above), ior, k)
+    return map_channels(lambda ior, k: fresnel.conductor(cosine, ior / above, k / above), ior, k)
 
 
 def _facets(h: Vector, wi: Vector, wo: Vector, alpha: Array) -> tuple[Array, Array]:
@@ -160,14 +160,14 @@ def _facets(h: Vector, wi: Vector, wo: Vector, alpha: Array) -> tuple[Array, Arr
     return ggx_density(h, alpha) * visible, 4.0 * wi[2] * wo[2] * visible
 
 
-def _refracted(wi: Vector, wo: Vector, h: Vector, cosine: Array, ior: Array) -> tuple[Vector, Vector, Array, Array]:
+def _refract_pair(wi: Vector, wo: Vector, h: Vector, cosine: Array, ior: Array) -> tuple[Vector, Vector, Array, Array]:
     """wi' and wo', both upward, their cosine with h, and whether light comes in and leaves along them at all."""
     squared = squared_cosine_of_refraction(cosine, ior)
     exists = squared > 0
     turned = jnp.sqrt(jnp.where(exists, squared, 0.25))
     along = turned - cosine / ior
     wi, wo = combine(1.0 / ior, wi, along, h), combine(1.0 / ior, wo, along, h)
-    return sanitised(wi), sanitised(wo), turned, exists & is_above(wi) & is_above(wo)
+    return sanitise(wi), sanitise(wo), turned, exists & is_above(wi) & is_above(wo)
 
 
 def _choices(stack: Stack, wi: Vector) -> list[tuple[Array, Surface]]:
@@ -187,7 +187,7 @@ def _choices(stack: Stack, wi: Vector) -> list[tuple[Array, Surface]]:
         level = fresnel.dielectric(w[2], ior)
         energies.append((reached * level, ReflectingInterface(ior, layer.alpha)))
         reached = reached * (1.0 - level) ** 2
-        w, _, _, _ = _refracted(w, w, normal, w[2], ior)
+        w, _, _, _ = _refract_pair(w, w, normal, w[2], ior)
         above = layer.ior
     base = stack.base
     assert base is not None

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from fits.engines import Failure, connected, local_cluster, run
-from layerjax.compiling import FOLDER, LEAST
+from layerjax.compiling import CACHE_DIRECTORY, CACHE_LEAST_TIME
 from tests.helpers import tasks
 from tests.helpers.places import ROOT
 from tests.helpers.tasks import running, started, wait_until
@@ -70,7 +70,10 @@ def test_a_worker_has_the_settings_of_its_parent(client):
     for _, worker in run(tasks.surroundings, large, [0, 1], client=client.scheduler.address):
         assert worker["total"] == 64.0**3
         assert worker["double"]
-        assert (worker["cache"], worker["least"]) == (jax.config.values[FOLDER], jax.config.values[LEAST])
+        assert (worker["cache"], worker["least"]) == (
+            jax.config.values[CACHE_DIRECTORY],
+            jax.config.values[CACHE_LEAST_TIME],
+        )
         assert worker["flags"] == os.environ.get("XLA_FLAGS", "")  # with others, results differ in their last digits
         assert (worker["threads"], worker["interrupts"]) == ("1", True)
         np.testing.assert_array_equal(worker["shared"], large)

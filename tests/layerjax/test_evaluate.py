@@ -26,7 +26,7 @@ class Unevaluated(lj.SingleScattering):
     def coarser(self):
         return self if self.resolutions else None
 
-    def measured(self, *_):
+    def evaluate_batch(self, *_):
         raise AssertionError("evaluated")
 
 

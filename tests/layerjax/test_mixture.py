@@ -79,7 +79,7 @@ def test_a_key_is_that_of_the_same_part_inside_of_transformations() -> None:
     mixed = lj.Mixture({"paint": PAINT, "bare": BARE}, [0.3, 0.7])
     inside = jax.tree.map(lambda leaf: leaf, mixed)
     assert list(inside.parts) != list(mixed.parts)
-    draws = [of.weighed(lambda part, own: (type(part.base), own), jax.random.key(0)) for of in (mixed, inside)]
+    draws = [of.weighted_values(lambda part, own: (type(part.base), own), jax.random.key(0)) for of in (mixed, inside)]
     assert draws[0] == draws[1]
 
 

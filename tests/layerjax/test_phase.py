@@ -13,7 +13,7 @@ import layerjax as lj
 from layerjax._parameters import parameter
 from layerjax._shapes import channel_count
 from layerjax.directions import add, combine, dot, frame, half_vector, join, normalize, reflect, scale, split
-from layerjax.phase.contract import deflected
+from layerjax.phase.contract import deflect
 from layerjax.phase.moments import moments_by_quadrature
 
 
@@ -27,7 +27,7 @@ class Schlick(lj.PhaseFunction):
 
     def sample(self, wi, u1, u2):
         cosine = (2.0 * u1 + self.k - 1.0) / (2.0 * self.k * u1 - self.k + 1.0)
-        return deflected(wi, cosine, jnp.sqrt((1.0 - cosine) * (1.0 + cosine)), 2.0 * jnp.pi * u2)
+        return deflect(wi, cosine, jnp.sqrt((1.0 - cosine) * (1.0 + cosine)), 2.0 * jnp.pi * u2)
 
     def moments(self, count):
         return moments_by_quadrature(self.pdf, count, jnp.result_type(self.k))
@@ -42,10 +42,10 @@ class Ellipsoid(lj.PhaseFunction):
     m: jax.Array
 
     @property
-    def is_upright(self):
+    def is_axisymmetric(self):
         return False
 
-    def mirrored(self):
+    def mirror(self):
         return Ellipsoid(self.m * jnp.array([[1.0], [1.0], [-1.0]]))
 
     def cross_section(self, w):
@@ -265,7 +265,7 @@ def test_three_axes_of_different_lengths():
     one = lj.SingleScattering()
     values = lj.evaluate(stack, wi, wo, one)
     np.testing.assert_allclose(values, lj.evaluate(stack, wo, wi, one), rtol=1e-10)
-    turned = lj.Stack([stack.layers[1], lj.Medium(0.8, 0.9, phase.mirrored())])
+    turned = lj.Stack([stack.layers[1], lj.Medium(0.8, 0.9, phase.mirror())])
     flip = np.array([1.0, 1.0, -1.0])
     np.testing.assert_allclose(values, lj.evaluate(turned, wi * flip, wo * flip, one), rtol=1e-10)
     _, _, weight = lj.sample(stack, jnp.broadcast_to(WI, (DRAWS, 3)), jax.random.key(2), one)

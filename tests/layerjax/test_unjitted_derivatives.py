@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import layerjax as lj
-from layerjax._jacobian import MOST_PARAMETERS, MOST_SLOPES, few_parameters
+from layerjax._jacobian import MOST_PARAMETERS, MOST_SLOPES, has_few_parameters
 from layerjax.transport.adding_doubling.elements import linearize_element
 from layerjax.transport.adding_doubling.solve import Plan, _interface, _interface_step
 from tests.helpers.compilations import compiled_by
@@ -63,8 +63,8 @@ def same(found, expected, tolerance=1e-11):
 @pytest.fixture
 def ruled(monkeypatch):
     """How often the rule was used."""
-    calls, rule = [], EVALUATING.by_parameters
-    monkeypatch.setattr(EVALUATING, "by_parameters", lambda *given: calls.append(1) or rule(*given))
+    calls, rule = [], EVALUATING.differentiate_by_parameters
+    monkeypatch.setattr(EVALUATING, "differentiate_by_parameters", lambda *given: calls.append(1) or rule(*given))
     return calls
 
 
@@ -187,7 +187,7 @@ def test_many_numbers_and_large_batches_are_differentiated_on_the_way_back():
     seen = []
 
     def function(x, values):
-        seen.append(few_parameters({"known": 1.0, "x": x}, values))
+        seen.append(has_few_parameters({"known": 1.0, "x": x}, values))
         return jnp.sum(x)
 
     jax.grad(function)(jnp.ones(MOST_PARAMETERS), 10)

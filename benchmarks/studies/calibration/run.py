@@ -232,7 +232,7 @@ def _simulator(posterior: str, other: lj.Transport | None) -> Callable[..., Any]
     """The transport as the fits use it: one program for all truths, which knows the directions and nothing else."""
     case = _case(posterior, other)
     transport = case.transport
-    known = known_directions(case.geometry.wi, case.geometry.wo) if transport.uses_known else None
+    known = known_directions(case.geometry.wi, case.geometry.wo) if transport.uses_known_directions else None
     return jax.jit(lambda stack, wi, wo: evaluate_known(stack, wi, wo, transport, known=known))
 
 

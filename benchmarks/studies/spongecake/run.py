@@ -28,7 +28,7 @@ from layerjax.precompute.learning import Schedule
 from layerjax.precompute.spongecake import data as materials
 from layerjax.precompute.spongecake import training
 from layerjax.precompute.spongecake.maker import PLANS, SEED
-from layerjax.precompute.spongecake.training import ENERGY, Parts
+from layerjax.precompute.spongecake.training import ENERGY_WEIGHT, LobeFeatures
 
 KINDS: tuple[Kind, ...] = ("surface", "fiber")
 CAKE, FIRST = lj.SpongeCake(), lj.SingleScattering()
@@ -96,7 +96,7 @@ def _solved(work: Path, count: int, media: int, report: Callable[[str], None]) -
 
 def lobes_alone(stack: lj.Stack) -> lj.Prepared:
     """The stack made ready for SpongeCake without the factor that puts energies right."""
-    return eqx.tree_at(lambda ready: ready.state.second.bend, lj.prepare(stack, CAKE), None)
+    return eqx.tree_at(lambda ready: ready.state.second.energy_correction, lj.prepare(stack, CAKE), None)
 
 
 Ready = Callable[[lj.Stack], lj.Prepared]
@@ -109,14 +109,14 @@ def gains(work: Path, count: int, epochs: int, report: Callable[[str], None]) ->
         pass
     learned, test = materials.load(work, count, 1, "train", SEED), materials.load(work, count // 2, 1, "test", SEED)
     lossless = np.minimum(test.layers.albedo, test.layers.f0).min(axis=1) == 1.0
-    none = Parts(False, False, False, False)
+    none = LobeFeatures(False, False, False, False)
     steps = {
-        "as in the paper: one weight for both sides": (none, ENERGY),
-        "reflection and transmission apart": (none._replace(by_side=True), ENERGY),
-        "and blurred": (Parts(rim=False, slopes=False), ENERGY),
-        "and with a Schlick term": (Parts(slopes=False), ENERGY),
-        "and with slopes: as it ships": (Parts(), ENERGY),
-        "the same without the penalty on energy": (Parts(), 0.0),
+        "as in the paper: one weight for both sides": (none, ENERGY_WEIGHT),
+        "reflection and transmission apart": (none._replace(by_side=True), ENERGY_WEIGHT),
+        "and blurred": (LobeFeatures(rim=False, slopes=False), ENERGY_WEIGHT),
+        "and with a Schlick term": (LobeFeatures(slopes=False), ENERGY_WEIGHT),
+        "and with slopes: as it ships": (LobeFeatures(), ENERGY_WEIGHT),
+        "the same without the penalty on energy": (LobeFeatures(), 0.0),
     }
     rows = []
     with jax.enable_x64(False):

@@ -61,7 +61,7 @@ LOSSLESS = 0.35
 
 
 @dataclass(frozen=True)
-class Layers:
+class LayerParameters:
     """Parameters of n materials of k media each, all of one structure, (n, k) each; axis: (n, k, 3).
 
     kind: index in `KINDS`. alpha: roughness, or g of a Henyey-Greenstein medium.
@@ -83,14 +83,14 @@ class Samples:
     from above. values: (n, 3, i, o), 1/sr. Lit from below only with two media: a slab of one is the same from there.
     """
 
-    layers: Layers
+    layers: LayerParameters
     wi: NDArray[np.float32]
     wo: NDArray[np.float32]
     values: NDArray[np.float32]
 
 
 def stack_of(kinds: tuple[str, ...], tilted: bool, numbers: dict[str, Array]) -> Stack:
-    """The stack of one material; numbers as in `Layers`, without the first axis."""
+    """The stack of one material; numbers as in `LayerParameters`, without the first axis."""
     media = []
     for k, kind in enumerate(kinds):
         alpha = numbers["alpha"][k]
@@ -126,7 +126,7 @@ def load(folder: Path, count: int, media: int, split: Split, seed: int) -> Sampl
         with np.load(_path(folder, media, split, seed, number)) as archive:
             parts.append(dict(archive))
     whole = {name: np.concatenate([part[name] for part in parts])[:count] for name in parts[0]}
-    layers = Layers(**{field.name: whole.pop(field.name) for field in fields(Layers)})
+    layers = LayerParameters(**{field.name: whole.pop(field.name) for field in fields(LayerParameters)})
     return Samples(layers, **whole)
 
 
@@ -151,7 +151,7 @@ def shard(number: int, media: int, split: Split, seed: int) -> Samples:
 
 def draw_layers(
     random: np.random.Generator, media: int, count: int, widths: dict[bool, tuple[float, float]] = WIDTHS
-) -> tuple[Layers, bool]:
+) -> tuple[LayerParameters, bool]:
     """Parameters of `count` materials of one structure, and whether any of their media has an axis of its own.
 
     widths: range of alpha, as `WIDTHS`.
@@ -173,7 +173,7 @@ def draw_layers(
     sine = np.sqrt(1.0 - cosine**2)
     axis = np.stack([sine * np.cos(turn), sine * np.sin(turn), cosine], -1)
     axis = np.where(tilted[:, None], axis, [0.0, 0.0, 1.0])
-    return Layers(np.broadcast_to(kinds, size).copy(), alpha, thickness, albedo, f0, axis), bool(tilted.any())
+    return LayerParameters(np.broadcast_to(kinds, size).copy(), alpha, thickness, albedo, f0, axis), bool(tilted.any())
 
 
 def draw_directions(random: np.random.Generator, count: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

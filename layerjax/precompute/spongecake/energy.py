@@ -2,8 +2,8 @@
 
 How much light several collisions leave is known of media that absorb nothing: 1 less what passes untouched and what one
 collision scatters. The same media without absorption therefore tell by how much the second lobe is off. The factor c of
-`layerjax.transport.spongecake.bending` is found by scaling again and again (Sinkhorn) at a few directions, each against
-all directions of the other end.
+`layerjax.transport.spongecake.energy_correction` is found by scaling again and again (Sinkhorn) at a few
+directions, each against all directions of the other end.
 """
 
 from collections.abc import Mapping
@@ -15,13 +15,13 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from layerjax._numerics import at_least
+from layerjax._numerics import clamp_min
 from layerjax.directions import Vector
 from layerjax.phase import SGGX
 from layerjax.quadrature import gauss_legendre
 from layerjax.stack import Medium, optical_depths
 from layerjax.transport.single_scattering import Media, SingleScattering
-from layerjax.transport.spongecake.bending import polynomial, terms_of
+from layerjax.transport.spongecake.energy_correction import polynomial, term_count
 from layerjax.transport.spongecake.lobes import flux, has_axes, second_lobe
 from layerjax.transport.spongecake.mapping import LEAST_ALPHA
 
@@ -62,19 +62,21 @@ def balance(media: tuple[Medium, ...], networks: Mapping[int, eqx.nn.MLP], rule:
     """Find log c of one medium or two, whatever they absorb."""
     white = tuple(_white(medium) for medium in media)
     first, second = Media(white, None), second_lobe(white, networks)
-    turning, opposite = has_axes(white), len(white) == 1
+    anisotropic, opposite = has_axes(white), len(white) == 1
     dtype = second.weights.levels.dtype
-    wi, weight = _directions(rule, _azimuth(white) if turning else None, opposite, dtype)
+    wi, weight = _directions(rule, _azimuth(white) if anisotropic else None, opposite, dtype)
 
     def one(wi: Vector) -> tuple[Array, list[tuple[Array, Array]]]:
         near, far = SingleScattering().albedo(first, wi, rule.nodes)
         depths = [depth for (depth,) in optical_depths(white, wi)]
         wanted = 1.0 - near[0] - far[0] - jnp.exp(-sum(depths[1:], depths[0]))
-        there = [(_terms(wo, turning, opposite), value) for wo, (value,) in flux(second, wi, rule.nodes, opaque=False)]
-        return at_least(wanted, 0.0), there
+        there = [
+            (_terms(wo, anisotropic, opposite), value) for wo, (value,) in flux(second, wi, rule.nodes, opaque=False)
+        ]
+        return clamp_min(wanted, 0.0), there
 
     wanted, there = jax.lax.map(one, wi, batch_size=BATCH)
-    here = _terms(wi, turning, opposite)
+    here = _terms(wi, anisotropic, opposite)
     sure = (weight * wanted)[:, None] * here
     normal = sure.T @ here
     stiffness = STIFFNESS * (jnp.trace(normal) / normal.shape[0] + LEAST)
@@ -94,7 +96,7 @@ def _white(medium: Medium) -> Medium:
     """The medium without absorption, and with lobes no narrower than any that the networks know."""
     phase, flakes = medium.phase, medium.phase.flakes
     if flakes is not None:
-        phase = SGGX(flakes.kind, at_least(jnp.asarray(flakes.alpha), LEAST_ALPHA), flakes.axis)
+        phase = SGGX(flakes.kind, clamp_min(jnp.asarray(flakes.alpha), LEAST_ALPHA), flakes.axis)
     white = Medium(medium.thickness, 1.0, phase)
     return eqx.tree_at(lambda m: m.albedo, white, 1.0)  # known: nothing to multiply by
 
@@ -124,9 +126,9 @@ def _directions(rule: Rule, azimuth: Array | None, opposite: bool, dtype: Any) -
     return (wi[0], wi[1], wi[2]), jnp.asarray(np.tile(np.repeat(w * x, count), len(sides)), dtype)
 
 
-def _terms(w: Vector, turning: bool, opposite: bool) -> Array:
+def _terms(w: Vector, anisotropic: bool, opposite: bool) -> Array:
     """What log c is a sum of, (..., terms); where sides differ, for above and below, 0 on the side where w is not."""
-    each = jnp.eye(terms_of(turning), dtype=w[2].dtype)
+    each = jnp.eye(term_count(anisotropic), dtype=w[2].dtype)
     terms = jax.vmap(lambda coefficients: polynomial(coefficients, w, opposite), out_axes=-1)(each)
     if opposite:
         return terms

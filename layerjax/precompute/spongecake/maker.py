@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from layerjax.precompute.learning import Schedule
-from layerjax.precompute.spongecake import bending, data, training
+from layerjax.precompute.spongecake import data, energy_correction, training
 from layerjax.precompute.spongecake.data import Split
 from layerjax.transport.spongecake.mapping import pack
 
@@ -26,7 +26,7 @@ SEED = 2022
 
 
 @dataclass(frozen=True)
-class Plan:
+class TrainingPlan:
     """How much is learned from and tested with, and for how long. Materials by the number of their media: one, two."""
 
     train: tuple[int, int]
@@ -35,14 +35,14 @@ class Plan:
 
 
 PLANS = {
-    False: Plan((4096, 4608), (640, 512), Schedule()),
-    True: Plan((64, 64), (32, 32), Schedule(epochs=20, batch=16)),
+    False: TrainingPlan((4096, 4608), (640, 512), Schedule()),
+    True: TrainingPlan((64, 64), (32, 32), Schedule(epochs=20, batch=16)),
 }
 """By whether the networks are coarse: of second lobes."""
 
-BENDING = {
-    False: Plan((30720, 30720), (2048, 2048), Schedule(epochs=150, batch=128)),
-    True: Plan((256, 256), (256, 256), Schedule(epochs=10, batch=32)),
+CORRECTION_PLANS = {
+    False: TrainingPlan((30720, 30720), (2048, 2048), Schedule(epochs=150, batch=128)),
+    True: TrainingPlan((256, 256), (256, 256), Schedule(epochs=10, batch=32)),
 }
 """And of what puts their energy right."""
 
@@ -65,13 +65,13 @@ def make(coarse: bool = False, work: Path = Path("spongecake-data"), report: Rep
     table: dict[str, NDArray] = {"seed": np.asarray(SEED)}
     for media in (1, 2):
         net, numbers = _second_lobe(media, PLANS[coarse], work, report)
-        bent = _bend(media, net, BENDING[coarse], work, report)
+        corrections = _energy_correction(media, net, CORRECTION_PLANS[coarse], work, report)
         table |= {f"{media}-{name}": value for name, value in numbers.items()}
-        table |= {f"{media}-bend-{name}": value for name, value in bent.items()}
+        table |= {f"{media}-bend-{name}": value for name, value in corrections.items()}
     return table
 
 
-def _second_lobe(media: int, plan: Plan, work: Path, report: Report) -> tuple[eqx.nn.MLP, dict[str, NDArray]]:
+def _second_lobe(media: int, plan: TrainingPlan, work: Path, report: Report) -> tuple[eqx.nn.MLP, dict[str, NDArray]]:
     """The network, and its numbers and record by name."""
     count, tested, schedule = plan.train[media - 1], plan.test[media - 1], plan.schedule
     splits: tuple[tuple[Split, int], ...] = (("train", count), ("test", tested))
@@ -93,26 +93,31 @@ def _second_lobe(media: int, plan: Plan, work: Path, report: Report) -> tuple[eq
     return net, pack(net) | _record(media, plan, curve, error)
 
 
-def _bend(media: int, net: eqx.nn.MLP, plan: Plan, work: Path, report: Report) -> dict[str, NDArray]:
+def _energy_correction(
+    media: int, net: eqx.nn.MLP, plan: TrainingPlan, work: Path, report: Report
+) -> dict[str, NDArray]:
     """Numbers and record by name of the network that puts the energy of another right."""
     count, tested = plan.train[media - 1], plan.test[media - 1]
     own = work / f"{hashlib.sha256(b''.join(part.tobytes() for part in pack(net).values())).hexdigest()[:12]}"
-    for there in bending.make(own, count + tested, media, {media: net}, SEED):
+    for there in energy_correction.make(own, count + tested, media, {media: net}, SEED):
         report(f"media {media}: energy: {there}/{count + tested}")
-    bent = bending.load(own, count + tested, media, SEED)
-    learned, held_out = bending.rows_of(bent, slice(count)), bending.rows_of(bent, slice(count, None))
+    corrections = energy_correction.load(own, count + tested, media, SEED)
+    learned, held_out = (
+        energy_correction.select(corrections, slice(count)),
+        energy_correction.select(corrections, slice(count, None)),
+    )
 
     def say(line: str) -> None:
         report(f"media {media}: energy: {line}")
 
     with jax.enable_x64(False):
-        bend, curve = bending.train(media, learned, SEED, plan.schedule, own / _state(media, plan), say)
-        error = np.percentile(np.abs(bending.errors(bend, held_out)), PERCENTILES)
+        network, curve = energy_correction.train(media, learned, SEED, plan.schedule, own / _state(media, plan), say)
+        error = np.percentile(np.abs(energy_correction.errors(network, held_out)), PERCENTILES)
     report(f"media {media}: energy: missing energy, median and 95th percentile: {error.round(4).tolist()}")
-    return pack(bend) | _record(media, plan, curve, error)
+    return pack(network) | _record(media, plan, curve, error)
 
 
-def _record(media: int, plan: Plan, curve: NDArray, error: NDArray) -> dict[str, NDArray]:
+def _record(media: int, plan: TrainingPlan, curve: NDArray, error: NDArray) -> dict[str, NDArray]:
     schedule = plan.schedule
     return {
         "materials": np.asarray((plan.train[media - 1], plan.test[media - 1])),
@@ -122,6 +127,6 @@ def _record(media: int, plan: Plan, curve: NDArray, error: NDArray) -> dict[str,
     }
 
 
-def _state(media: int, plan: Plan) -> str:
+def _state(media: int, plan: TrainingPlan) -> str:
     """Name of the file that a training resumes from."""
     return f"state-{media}-{SEED}-{plan.train[media - 1]}-{plan.schedule.epochs}-{plan.schedule.batch}.eqx"

@@ -4,9 +4,9 @@ Media of all kinds are trained together, so their kind is a number here: the lob
 phase function that picks its kind by that number.
 
 Loss of a material: the relative L2 error of its BSDF, first order included (weighted with both cosines; all sides
-together, and half of each side by itself), a fifth of that of its multiple scattering alone, and `ENERGY` times the
-error of its directional albedos. The mean of the channels that decides the lobe's shape is drawn at random for half of
-the materials, so that a channel may differ from it.
+together, and half of each side by itself), a fifth of that of its multiple scattering alone, and `ENERGY_WEIGHT` times
+the error of its directional albedos. The mean of the channels that decides the lobe's shape is drawn at random for half
+of the materials, so that a channel may differ from it.
 """
 
 import functools
@@ -25,7 +25,7 @@ from layerjax.channels import Channels
 from layerjax.directions import Vector, split
 from layerjax.phase import HenyeyGreenstein, PhaseFunction
 from layerjax.precompute.learning import Schedule, learn
-from layerjax.precompute.spongecake.data import KINDS, Layers, Samples
+from layerjax.precompute.spongecake.data import KINDS, LayerParameters, Samples
 from layerjax.stack import Medium
 from layerjax.transport.contract import Side
 from layerjax.transport.single_scattering import Media, SingleScattering
@@ -33,20 +33,20 @@ from layerjax.transport.spongecake.lobes import BlurredSGGX, SecondLobe, evaluat
 from layerjax.transport.spongecake.mapping import Numbers, Weights, network, shape_of, weights_of
 
 HG = KINDS.index("hg")
-ENERGY = 0.5
+ENERGY_WEIGHT = 0.5
 """Weight of errors of albedos in the loss."""
 
-FAR = 4.0
+TAIL_WEIGHT = 4.0
 """Weight of the squared error of R + T beside the error itself, for the sake of the few that are far off."""
 
-MULTIPLE, APART = 0.2, 0.5
+MULTIPLE_WEIGHT, SIDE_WEIGHT = 0.2, 0.5
 """Weights of the error of multiple scattering alone, and of that of each side by itself."""
 
 SPREAD = 0.2
 """How far mean albedos are drawn from those of the channel, standard deviation; half of it for f0."""
 
 
-class Parts(NamedTuple):
+class LobeFeatures(NamedTuple):
     """What the second lobe has beyond the paper's: to measure the gain of each. `by_side`: weights of the two sides."""
 
     blur: bool = True
@@ -55,7 +55,7 @@ class Parts(NamedTuple):
     by_side: bool = True
 
 
-ALL_PARTS = Parts()
+ALL_PARTS = LobeFeatures()
 
 
 class Batch(NamedTuple):
@@ -85,13 +85,13 @@ def batch_of(samples: Samples) -> Batch:
     sides = sides_of(samples.layers.kind.shape[1])
     wi = samples.wi[:, [1 if side == 1 else 0 for side in sides]]
     wo, values = samples.wo[:, sides], samples.values[:, sides]
-    first = _in_parts(jax.vmap(_first), (jax.tree.map(jnp.asarray, numbers), wi, wo))
+    first = _map_parts(jax.vmap(_first), (jax.tree.map(jnp.asarray, numbers), wi, wo))
     weight = np.abs(wi[..., 2])[..., None]
     size, multiple = (np.sqrt(np.mean(weight * v * v, (2, 3))) for v in (values + first, values))
     return Batch(numbers, *(cast(Array, array) for array in (wi, wo, values, first, size, multiple)))
 
 
-def numbers_of(layers: Layers) -> Numbers:
+def numbers_of(layers: LayerParameters) -> Numbers:
     """The materials as the networks take them, on the host, where rows are picked."""
     kind = layers.kind
     hg = kind == HG
@@ -118,7 +118,7 @@ def predict(
     mean_f0: Array,
     wi: Array,
     wo: Array,
-    parts: Parts = ALL_PARTS,
+    parts: LobeFeatures = ALL_PARTS,
 ) -> Array:
     """Multiple scattering of one material as the network has it, (s, i, o)."""
     shape = shape_of(net, media._replace(albedo=mean_albedo, f0=mean_f0))
@@ -136,9 +136,11 @@ def predict(
     return _values(lambda wi, wo, side: evaluate_second(second, wi, wo, side, False), len(slab.media), wi, wo)
 
 
-def errors(net: eqx.nn.MLP, batch: Batch, parts: Parts = ALL_PARTS) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def errors(
+    net: eqx.nn.MLP, batch: Batch, parts: LobeFeatures = ALL_PARTS
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Norms of the error for each pair of sides, (n, s), and errors of directional albedos, (n, s, i)."""
-    return _in_parts(lambda piece: _errors(net, piece, parts), (batch,))
+    return _map_parts(lambda piece: _errors(net, piece, parts), (batch,))
 
 
 def train(
@@ -148,8 +150,8 @@ def train(
     schedule: Schedule,
     state: Path | None = None,
     report: Callable[[str], Any] = print,
-    energy: float = ENERGY,
-    parts: Parts = ALL_PARTS,
+    energy: float = ENERGY_WEIGHT,
+    parts: LobeFeatures = ALL_PARTS,
 ) -> tuple[eqx.nn.MLP, NDArray[np.float32]]:
     """The trained network, and the mean loss of each epoch; the rest as in `layerjax.precompute.learning.learn`."""
     batch = batch_of(samples)
@@ -165,7 +167,9 @@ def train(
     return learn(net, loss, drawn, len(batch.values), [seed, media], schedule, state, report)
 
 
-def _loss(net: eqx.nn.MLP, batch: Batch, mean_albedo: Array, mean_f0: Array, energy: float, parts: Parts) -> Array:
+def _loss(
+    net: eqx.nn.MLP, batch: Batch, mean_albedo: Array, mean_f0: Array, energy: float, parts: LobeFeatures
+) -> Array:
     squares, albedos = jax.vmap(functools.partial(_residual, net, parts))(batch, mean_albedo, mean_f0)
     whole, apart = jnp.sum(batch.size**2, -1), batch.size**2
     tiny = 1e-8
@@ -173,12 +177,14 @@ def _loss(net: eqx.nn.MLP, batch: Batch, mean_albedo: Array, mean_f0: Array, ene
     each = jnp.mean(jnp.sqrt(squares / (apart + 1e-3 * whole[:, None]) + tiny), -1)
     multiple = jnp.sqrt(jnp.sum(squares, -1) / (jnp.sum(batch.size_multiple**2, -1) + 1e-12) + tiny)
     sums = albedos[:, 0] + albedos[:, -1]
-    both = jnp.mean(jnp.abs(sums) + FAR * sums * sums, -1)
+    both = jnp.mean(jnp.abs(sums) + TAIL_WEIGHT * sums * sums, -1)
     single = jnp.mean(jnp.abs(albedos), (1, 2))
-    return jnp.mean(full + APART * each + MULTIPLE * multiple + energy * (both + 0.5 * single))
+    return jnp.mean(full + SIDE_WEIGHT * each + MULTIPLE_WEIGHT * multiple + energy * (both + 0.5 * single))
 
 
-def _residual(net: eqx.nn.MLP, parts: Parts, batch: Batch, mean_albedo: Array, mean_f0: Array) -> tuple[Array, Array]:
+def _residual(
+    net: eqx.nn.MLP, parts: LobeFeatures, batch: Batch, mean_albedo: Array, mean_f0: Array
+) -> tuple[Array, Array]:
     """Squared norms of the error, (s,), and errors of albedos, (s, i), of one material."""
     error = predict(net, batch.media, mean_albedo, mean_f0, batch.wi, batch.wo, parts) - batch.values
     weight = jnp.abs(batch.wi[..., 2])[..., None]
@@ -186,7 +192,7 @@ def _residual(net: eqx.nn.MLP, parts: Parts, batch: Batch, mean_albedo: Array, m
 
 
 @eqx.filter_jit
-def _errors(net: eqx.nn.MLP, batch: Batch, parts: Parts) -> tuple[Array, Array]:
+def _errors(net: eqx.nn.MLP, batch: Batch, parts: LobeFeatures) -> tuple[Array, Array]:
     squares, albedos = jax.vmap(functools.partial(_residual, net, parts))(batch, batch.media.albedo, batch.media.f0)
     return jnp.sqrt(squares), albedos
 
@@ -214,17 +220,17 @@ class PhaseOfKind(PhaseFunction):
     blur: Array
 
     def cross_section(self, w: Vector) -> Array:
-        return self._chosen([phase.cross_section(w) for phase in self._phases()])
+        return self._choose([phase.cross_section(w) for phase in self._phases()])
 
     def kernel(self, wi: Vector, wo: Vector, h: Vector | None) -> Array:
-        return self._chosen([phase.kernel(wi, wo, h) for phase in self._phases()])
+        return self._choose([phase.kernel(wi, wo, h) for phase in self._phases()])
 
     def pdf(self, wi: Vector, wo: Vector) -> Array:
         return self.kernel(wi, wo, None) / self.cross_section(wi)
 
     def sample(self, wi: Vector, u1: Array, u2: Array) -> Vector:
         drawn = [phase.sample(wi, u1, u2) for phase in self._phases()]
-        x, y, z = (self._chosen(list(part)) for part in zip(*drawn, strict=True))
+        x, y, z = (self._choose(list(part)) for part in zip(*drawn, strict=True))
         return x, y, z
 
     def _phases(self) -> list[PhaseFunction]:
@@ -234,7 +240,7 @@ class PhaseOfKind(PhaseFunction):
         flakes = (BlurredSGGX(kind, width, self.axis, self.blur) for kind in ("surface", "fiber"))
         return [*flakes, HenyeyGreenstein(g)]
 
-    def _chosen(self, values: list[Array]) -> Array:
+    def _choose(self, values: list[Array]) -> Array:
         return functools.reduce(lambda other, k: jnp.where(self.kind[k] > 0, values[k], other), range(HG), values[HG])
 
 
@@ -260,7 +266,7 @@ def _values(values: Callable[[Vector, Vector, Side], Channels], media: int, wi: 
     return jnp.stack([values(*pair)[0] for pair in pairs])
 
 
-def _in_parts(work: Callable[..., Any], arguments: tuple[Any, ...], size: int = 256) -> Any:
+def _map_parts(work: Callable[..., Any], arguments: tuple[Any, ...], size: int = 256) -> Any:
     """work on parts of a batch, put together again."""
     count = len(jax.tree.leaves(arguments)[0])
     run = eqx.filter_jit(work)

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from layerjax._numerics import at_least, safe_sqrt
+from layerjax._numerics import clamp_min, safe_sqrt
 from layerjax.channels import Channels
 from layerjax.directions import Vector
 from layerjax.surfaces.vmf_diffuse.flakes import POROUS, porous_concentration
@@ -155,4 +155,4 @@ def _evaluate(wi: Vector, wo: Vector, modes: Array, spread: Array) -> tuple[Arra
     ratio = facing_i * facing_o / (ui * mean_o + uo * mean_i)
     # mode by mode: the places may have fewer azimuths than the directions
     shapes = [sum((g * turn for g, turn in zip(each, cosines, strict=True)), jnp.zeros_like(along)) for each in smooth]
-    return tuple(at_least(ratio * shape, 0.0) for shape in shapes)
+    return tuple(clamp_min(ratio * shape, 0.0) for shape in shapes)

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from jax import Array
 from jax.scipy.special import i0e, i1e
 
-from layerjax._numerics import at_least, at_most, exprel, safe_sqrt
+from layerjax._numerics import clamp_max, clamp_min, exprel, safe_sqrt
 from layerjax.directions import Vector
 from layerjax.normals.vmf import resultant
 from layerjax.quadrature import gauss_legendre
@@ -43,7 +43,7 @@ def concentration(roughness: Array) -> Array:
     so that its slope there is large, -9,500, and not infinite.
     """
     near_one = roughness > POROUS
-    r = at_least(jnp.where(near_one, 0.5, roughness), LEAST_ROUGHNESS)
+    r = clamp_min(jnp.where(near_one, 0.5, roughness), LEAST_ROUGHNESS)
     alpha = jnp.log1p(safe_sqrt(r)) - jnp.log1p(-r)
     return jnp.where(near_one, porous_concentration(roughness), 2.0 / (alpha * alpha))
 
@@ -71,21 +71,21 @@ def _facing_away(cosine: Array, sine: Array, k: Array) -> Array:
     dtype = jnp.result_type(cosine, k)
     x, weight = (jnp.asarray(a, dtype) for a in gauss_legendre(20 if jnp.finfo(dtype).bits == 64 else 16))
     # beyond the end the density is below e^-40; where the nodes lie changes nothing, so no derivative goes through them
-    end = jax.lax.stop_gradient(at_most(9.0 / jnp.sqrt(at_least(k, 1.0)), 0.5 * jnp.pi))
+    end = jax.lax.stop_gradient(clamp_max(9.0 / jnp.sqrt(clamp_min(k, 1.0)), 0.5 * jnp.pi))
     t = end * x
     up, across = jnp.sin(t), jnp.cos(t)
     tilt = jnp.arctan2(cosine, sine)[..., None]
-    ring = jnp.exp(-2.0 * k * jnp.sin(0.5 * (tilt + t)) ** 2) * _decayed_i0(k * sine[..., None] * across)
+    ring = jnp.exp(-2.0 * k * jnp.sin(0.5 * (tilt + t)) ** 2) * _scaled_i0(k * sine[..., None] * across)
     return end * jnp.sum(weight * up * across * ring, axis=-1) / (2.0 * exprel(2.0 * k))
 
 
 @jax.custom_jvp
-def _decayed_i0(x: Array) -> Array:
+def _scaled_i0(x: Array) -> Array:
     """exp(-x) I0(x) for x >= 0: its slope at 0 is -1, where that of `i0e`, which is even, is given as 0."""
     return i0e(x)
 
 
-@_decayed_i0.defjvp
-def _decayed_i0_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
+@_scaled_i0.defjvp
+def _scaled_i0_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
     value = i0e(*primals)
     return value, (i1e(*primals) - value) * tangents[0]

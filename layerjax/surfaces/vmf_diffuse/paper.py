@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jax import Array
 from jax.scipy.special import erf
 
-from layerjax._numerics import at_least, at_most, safe_sqrt
+from layerjax._numerics import clamp_max, clamp_min, safe_sqrt
 from layerjax.channels import Channels
 from layerjax.directions import Vector
 from layerjax.surfaces.vmf_diffuse.coefficients import Terms, first_order, second_order, third_order
@@ -32,14 +32,14 @@ def paper_brdf(wi: Vector, wo: Vector, albedos: Channels, roughness: Array, form
     shape = _direction_factor(wi[2] * wo[2], r, form)
 
     def multiple(c: Array) -> Array:
-        return at_least(_albedo_factor(c, r, form) * shape, 0.0)
+        return clamp_min(_albedo_factor(c, r, form) * shape, 0.0)
 
     # at roughness 0, where the value leaps to that of a Lambertian, the slope in roughness is still that of the fit
-    (f1, f2, f3), (s1, s2, s3) = orders, map(_slope_alone, orders)
+    (f1, f2, f3), (s1, s2, s3) = orders, map(_zero_with_slope, orders)
     values = []
     for c in albedos:
         fitted = c * (f1 + c * (f2 + c * f3)) + multiple(c)  # Eq. (7)
-        flat = c / jnp.pi + c * (s1 + c * (s2 + c * s3)) + _slope_alone(multiple(jax.lax.stop_gradient(c)))
+        flat = c / jnp.pi + c * (s1 + c * (s2 + c * s3)) + _zero_with_slope(multiple(jax.lax.stop_gradient(c)))
         values.append(jnp.where(rough, fitted, flat))
     return tuple(values)
 
@@ -68,11 +68,11 @@ def scattering_orders(wi: Vector, wo: Vector, r: Array) -> Orders:
         return (steady + 2.0 * x * (once[0] + once[1] * product + once[2] * total)) / total
 
     orders = single, later(*second_order(r)), later(*third_order(r))
-    first, second, third = (at_least(order, 0.0) / jnp.pi for order in orders)
+    first, second, third = (clamp_min(order, 0.0) / jnp.pi for order in orders)
     return first, second, third
 
 
-class Fit(NamedTuple):
+class FitConstants(NamedTuple):
     """Constants of Eq. (9): of the exponent's X, of the powers' base, of C_k, and of the rest."""
 
     x: tuple[float, float]
@@ -83,8 +83,8 @@ class Fit(NamedTuple):
     shape: tuple[float, float, float]
 
 
-FITS: dict[PaperForm, Fit] = {
-    "paper": Fit(
+FITS: dict[PaperForm, FitConstants] = {
+    "paper": FitConstants(
         (0.264641, 0.0225272),
         (1.0075, 1.16942),
         (0.5441615108674713, 0.45302863761693374, 1.4293127703064865),
@@ -92,7 +92,7 @@ FITS: dict[PaperForm, Fit] = {
         0.341969,
         (0.0898863, 0.0578978, 0.287663),
     ),
-    "literal": Fit((0.265, 0.0225), (1.0, 1.169), (0.544, 0.453, 1.429), 0.384, 0.342, (0.09, 0.0579, 0.288)),
+    "literal": FitConstants((0.265, 0.0225), (1.0, 1.169), (0.544, 0.453, 1.429), 0.384, 0.342, (0.09, 0.0579, 0.288)),
 }
 """Eq. (9) as printed ("literal"), and with the digits that implementations of it carry ("paper")."""
 
@@ -122,9 +122,9 @@ def flake_albedo(k: Array, r: Array) -> Array:
     strength = 0.64985 + 0.631112 * r + 1.38922 * r * r  # s
     x = 2.0 * strength * k / (1.0 - k + jnp.hypot(1.0 - k, 2.0 * strength * k))
     root = safe_sqrt(r)
-    return at_most(x * root + (1.0 - root) * k, 1.0)
+    return clamp_max(x * root + (1.0 - root) * k, 1.0)
 
 
-def _slope_alone(x: Array) -> Array:
+def _zero_with_slope(x: Array) -> Array:
     """0, with the derivatives of x."""
     return x - jax.lax.stop_gradient(x)

@@ -13,7 +13,7 @@ from jax import Array
 from jax.typing import ArrayLike
 
 from layerjax._checks import require_choice
-from layerjax._numerics import at_least, at_most, safe_div, safe_sqrt
+from layerjax._numerics import clamp_max, clamp_min, safe_div, safe_sqrt
 from layerjax._parameters import Parameter, is_placeholder, parameter
 from layerjax.channels import per_channel
 from layerjax.directions import Vector, add, combine, dot, frame, normalize, scale, select
@@ -85,7 +85,7 @@ class VMFDiffuse(Surface):
 
     def pdf(self, wi: Vector, wo: Vector) -> Array:
         share, axis = self._proposal(wi)
-        return (0.5 * share + (1.0 - share) * at_least(dot(axis, wo), 0.0)) / jnp.pi
+        return (0.5 * share + (1.0 - share) * clamp_min(dot(axis, wo), 0.0)) / jnp.pi
 
     def _proposal(self, wi: Vector) -> tuple[Array, Vector]:
         """Share of uniform draws, and the axis of the lobe of the others."""
@@ -115,12 +115,12 @@ class VMFDiffuse(Surface):
         for name, value in (("diffuse_albedo", target.albedo), ("roughness", target.roughness)):
             if is_placeholder(value):
                 raise ValueError(f"VMFDiffuse.from_diffuse_albedo: {name} is not given a value")
-        albedo = _solved(target) if exact else flake_albedo(target.albedo, target.roughness)
+        albedo = _solve_albedo(target) if exact else flake_albedo(target.albedo, target.roughness)
         return cls(albedo, target.roughness, form)
 
 
 @eqx.filter_jit
-def _solved(target: VMFDiffuse) -> Array:
+def _solve_albedo(target: VMFDiffuse) -> Array:
     """Albedo of the flakes with which the surface has the target's albedo at normal incidence, by bisection."""
     wanted, r = jnp.broadcast_arrays(jnp.atleast_1d(target.albedo), target.roughness)[0], target.roughness
     x, w = (jnp.asarray(array, wanted.dtype) for array in gauss_legendre(NODES))
@@ -143,4 +143,4 @@ def _solved(target: VMFDiffuse) -> Array:
     # one step of Newton's method carries the derivatives
     slope = jax.jvp(lambda c: energy(c, r), (near,), (jnp.ones_like(near),))[1]
     found = near + (wanted - energy(near, r)) / jax.lax.stop_gradient(slope)
-    return at_most(at_least(found, 0.0), 1.0).reshape(target.albedo.shape)
+    return clamp_max(clamp_min(found, 0.0), 1.0).reshape(target.albedo.shape)

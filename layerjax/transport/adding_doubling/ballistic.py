@@ -14,15 +14,23 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from layerjax._batching import by_rows
+from layerjax._batching import map_row_chunks
 from layerjax._numerics import horizon, safe_sqrt, smooth_step
-from layerjax.channels import Channels, each, total
-from layerjax.directions import Vector, flip, sanitised, select
+from layerjax.channels import Channels, map_channels, total
+from layerjax.directions import Vector, flip, sanitise, select
 from layerjax.stack import Interface, Medium, Stack, optical_depths
 from layerjax.surfaces.interface import continued_transmission, is_index_matched
-from layerjax.transport.adding_doubling.facet_light import Normals, facet_spacing, refracted_rays
-from layerjax.transport.adding_doubling.operators import Layer, Operator, left, matmul, plus, right, times
-from layerjax.transport.adding_doubling.requested import requested_region, turn
+from layerjax.transport.adding_doubling.facet_scattering import Normals, facet_spacing, refracted_rays
+from layerjax.transport.adding_doubling.operators import (
+    Layer,
+    Operator,
+    add_operators,
+    matmul,
+    multiply,
+    scale_columns,
+    scale_rows,
+)
+from layerjax.transport.adding_doubling.requested_directions import requested_region, turn
 from layerjax.transport.adding_doubling.resolution import is_tilted
 
 POINTS = (16, 12)
@@ -32,7 +40,7 @@ EDGE = 7.5
 """Times the distance between rays: half the width over which the end of a lobe is rounded off, at facets that stand
 upright. Else values would change by steps of up to 3e-4 as an index moves rays across it."""
 
-AT_ONCE = 1 << 17
+BATCH_RAYS = 1 << 17
 """Rays that are followed together."""
 
 TINY = 1e-18
@@ -47,7 +55,7 @@ class Ballistic(eqx.Module):
     media: tuple[tuple[Medium, ...], tuple[Medium, ...], tuple[Medium, ...]]
 
 
-class Lobe(NamedTuple):
+class BTDFLobe(NamedTuple):
     """A BTDF, continued beyond the facets that stand upright, and ended there: only the first has smooth weights."""
 
     continued: Array
@@ -74,24 +82,24 @@ def _faces(stack: Stack) -> tuple[int, int] | None:
     return (faces[0], faces[1]) if stack.base is None and len(faces) == 2 else None
 
 
-def without_ballistic(stack: Stack, layers: Sequence[Layer], whole: Layer) -> Layer:
+def subtract_ballistic(stack: Stack, layers: Sequence[Layer], whole: Layer) -> Layer:
     """The whole stack without the light that passes by two refractions alone, as its layers have it."""
     faces = _faces(stack)
     if faces is None:
         return whole
-    down = _refracted_twice([(layer.transmit_down.first, layer.direct_down) for layer in layers], faces)
+    down = _double_refraction([(layer.transmit_down.first, layer.direct_down) for layer in layers], faces)
     upward = [(layer.transmit_up.first, layer.direct_up) for layer in reversed(layers)]
-    up = _refracted_twice(upward, [len(layers) - 1 - place for place in faces])
+    up = _double_refraction(upward, [len(layers) - 1 - place for place in faces])
 
     def rest(layer: Layer) -> tuple[Operator, Operator]:
         return layer.transmit_down.rest, layer.transmit_up.rest
 
     return eqx.tree_at(
-        rest, whole, tuple(plus(part, -once) for part, once in zip(rest(whole), (down, up), strict=True))
+        rest, whole, tuple(add_operators(part, -once) for part, once in zip(rest(whole), (down, up), strict=True))
     )
 
 
-def _refracted_twice(layers: Sequence[tuple[Operator, Operator]], faces: Sequence[int]) -> Array:
+def _double_refraction(layers: Sequence[tuple[Operator, Operator]], faces: Sequence[int]) -> Array:
     """Flux that meets the two faces alone, of layers in the order in which light comes through them.
 
     layers: what each passes with one event, and what untouched.
@@ -100,11 +108,11 @@ def _refracted_twice(layers: Sequence[tuple[Operator, Operator]], faces: Sequenc
     passed: Operator = None
     for place, (through, direct) in enumerate(layers):
         if place in faces:
-            passed = right(through, before) if passed is None else matmul(through, passed)
+            passed = scale_columns(through, before) if passed is None else matmul(through, passed)
         elif passed is None:
-            before = times(before, direct)
+            before = multiply(before, direct)
         else:
-            passed = left(direct, passed)
+            passed = scale_rows(direct, passed)
     assert passed is not None
     return passed
 
@@ -120,7 +128,7 @@ def evaluate_ballistic(state: Ballistic, wi: Vector, wo: Vector) -> Channels:
     valid = (over[2] > edge) & (under[2] > edge)
     cosines = (jnp.where(valid, over[2], 0.5), jnp.where(valid, under[2], 0.5))
     rows = [jnp.broadcast_to(row, shape).ravel() for row in (valid, *cosines, turn(over, flip(under)))]
-    passed = partial(_passed, state)
+    passed = partial(_transmitted_bsdf, state)
 
     def nothing(*pairs: Array) -> Channels:
         return tuple(jnp.zeros(found.shape, found.dtype) for found in jax.eval_shape(passed, *pairs))
@@ -130,7 +138,7 @@ def evaluate_ballistic(state: Ballistic, wi: Vector, wo: Vector) -> Channels:
         return jax.lax.cond(jnp.any(crossing), passed, nothing, *pairs)
 
     rays = rows[0].size * 8 * POINTS[0] * POINTS[1]
-    found = by_rows(some, rows, rays // AT_ONCE)
+    found = map_row_chunks(some, rows, rays // BATCH_RAYS)
     outside = total(
         [*optical_depths(state.media[0], over), *optical_depths(state.media[2], flip(under)), (0.0 * over[2],)]
     )
@@ -139,10 +147,10 @@ def evaluate_ballistic(state: Ballistic, wi: Vector, wo: Vector) -> Channels:
     def value(passed: Array, depth: Array) -> Array:
         return jnp.where(valid, passed.reshape(shape) * level * jnp.exp(-depth), 0.0)
 
-    return each(value, found, outside)
+    return map_channels(value, found, outside)
 
 
-def _passed(state: Ballistic, cosine_i: Array, cosine_o: Array, azimuth: Array) -> Channels:
+def _transmitted_bsdf(state: Ballistic, cosine_i: Array, cosine_o: Array, azimuth: Array) -> Channels:
     """f from above to below for light along (-sin, 0, cos) that leaves turned by an azimuth: arrays (pairs,) each.
 
     With m between, g_i and g_o the BTDFs from m out along either direction, f = n^2 * integral of g_i g_o cos(m). Rays
@@ -160,13 +168,13 @@ def _passed(state: Ballistic, cosine_i: Array, cosine_o: Array, azimuth: Array) 
         EDGE * facet_spacing(POINTS[0], facets) * jnp.abs(1.0 - n) for n, facets in zip(ratios, faces, strict=True)
     ]
 
-    def parts(x: Array, y: Array, z: Array) -> tuple[Lobe, Lobe, Channels]:
+    def parts(x: Array, y: Array, z: Array) -> tuple[BTDFLobe, BTDFLobe, Channels]:
         """g_i, g_o / n_below^2 and what media pass, of travel along (x, y, -z) between the interfaces."""
         middle: Vector = (-x, -y, z)
         g_i = _lobe((x, y, z), over, ratios[0], faces[0], edges[1])
         g_o = _lobe(middle, under, ratios[1], faces[1], edges[0])
         depths = total([*optical_depths(state.media[1], middle), (jnp.zeros_like(z),)])
-        return g_i, Lobe(*(part / below**2 for part in g_o)), tuple(jnp.exp(-depth) for depth in depths)
+        return g_i, BTDFLobe(*(part / below**2 for part in g_o)), tuple(jnp.exp(-depth) for depth in depths)
 
     # a BTDF at equal indices is a delta: then the rays of that side are the whole
     delta_i, delta_o = is_index_matched(inner), is_index_matched(inner / below)
@@ -182,19 +190,19 @@ def _passed(state: Ballistic, cosine_i: Array, cosine_o: Array, azimuth: Array) 
     return total([from_above, from_below])
 
 
-def _lobe(wi: Vector, wo: Vector, ratio: Array, facets: Normals, edge: Array) -> Lobe:
+def _lobe(wi: Vector, wo: Vector, ratio: Array, facets: Normals, edge: Array) -> BTDFLobe:
     value, height = continued_transmission(wi, wo, ratio, *facets)
-    return Lobe(value, value * smooth_step(height / (edge + TINY)))
+    return BTDFLobe(value, value * smooth_step(height / (edge + TINY)))
 
 
-def _weight(one: Lobe, other: Lobe) -> Array:
+def _weight(one: BTDFLobe, other: BTDFLobe) -> Array:
     return one.continued / (one.continued + other.continued + TINY)
 
 
 def _rays(cosine: Array, ratio: Array, normals: Normals) -> tuple[Vector, Array]:
     """Where facets refract light along (-sin, 0, cos) to, z counted on the far side, and its shares."""
     rays, share = refracted_rays(requested_region(cosine, jnp.ones_like(ratio)), ratio, normals, POINTS)
-    x, y, z = sanitised(rays, rays[2] > 0)  # of rays back up, whose share is 0, masking has no meaning
+    x, y, z = sanitise(rays, rays[2] > 0)  # of rays back up, whose share is 0, masking has no meaning
 
     def both(part: Array, mirrored: Array) -> Array:  # shares stand for mirror images too
         return jnp.concatenate([part, mirrored], axis=-1)

@@ -6,14 +6,19 @@ import jax.numpy as jnp
 from jax import Array
 
 from layerjax import fresnel
-from layerjax._numerics import at_least, safe_div
+from layerjax._numerics import clamp_min, safe_div
 from layerjax.channels import per_channel, pick
 from layerjax.directions import Vector, reflect
 from layerjax.surfaces import Conductor, Surface
-from layerjax.transport.adding_doubling.facet_light import ENERGY_POINTS, Normals, of_facets, seen_share
+from layerjax.transport.adding_doubling.facet_scattering import (
+    ENERGY_POINTS,
+    Normals,
+    map_visible_normals,
+    smith_masking,
+)
 from layerjax.transport.adding_doubling.grid import Region
 from layerjax.transport.adding_doubling.operators import Layer, Parts
-from layerjax.transport.adding_doubling.sampling import modes_at_nodes, projected_weight, scaled_to_energy
+from layerjax.transport.adding_doubling.sampling import modes_at_nodes, projected_weight, scale_to_energy
 
 
 def base_layer(region: Region, base: Surface, modes: int, multiple: bool) -> Layer:
@@ -30,14 +35,16 @@ def _conductor(region: Region, base: Conductor, kernels: Sequence[Array], multip
     normals = Normals(base.alpha, base.distribution)
 
     def seen_by(m: Vector, facing: Array, weight: Array, wi: Vector) -> tuple[Array, Array]:
-        return facing, weight * seen_share(reflect(wi, m), normals)
+        return facing, weight * smith_masking(reflect(wi, m), normals)
 
-    cosine, seen = of_facets(seen_by, region, normals, jnp.ones((), region.cosine.dtype), "reflected", ENERGY_POINTS)
+    cosine, seen = map_visible_normals(
+        seen_by, region, normals, jnp.ones((), region.cosine.dtype), "reflected", ENERGY_POINTS
+    )
     ior, k = per_channel(base.ior), per_channel(base.k)
     operators, given = [], []
     for c, kernel in enumerate(kernels):
         energy = jnp.sum(seen * fresnel.conductor(cosine, pick(ior, c), pick(k, c)), axis=-1)
-        operators.append(scaled_to_energy(region, kernel, energy))
+        operators.append(scale_to_energy(region, kernel, energy))
         if multiple:
             gain = _coloured_return(energy, jnp.sum(seen, axis=-1), region.weight)
             given.append(jnp.zeros_like(operators[-1]).at[0].set(gain))
@@ -46,7 +53,7 @@ def _conductor(region: Region, base: Conductor, kernels: Sequence[Array], multip
 
 def _coloured_return(energy: Array, lossless: Array, weight: Array) -> Array:
     """What a conductor returns of the light lost to masking: it loses its Fresnel share at every further facet."""
-    lost = jnp.where(weight > 0, at_least(1.0 - lossless, 0.0), 0.0)
+    lost = jnp.where(weight > 0, clamp_min(1.0 - lossless, 0.0), 0.0)
     total = jnp.sum(weight * lost)
     # mean reflectance of a facet, and mean share that escapes at each try (Kulla & Conty 2017)
     level = safe_div(jnp.sum(weight * energy), jnp.sum(weight * lossless))

@@ -21,7 +21,7 @@ from jax.custom_derivatives import SymbolicZero
 
 from layerjax._devices import exact_products
 from layerjax._jacobian import primal
-from layerjax._numerics import broadcasting
+from layerjax._numerics import allow_broadcasting
 from layerjax.compiling import filter_jit, is_traced
 
 enable_x64: Any = getattr(jax if hasattr(jax, "enable_x64") else jax.experimental, "enable_x64")  # noqa: B009 (by version)
@@ -46,9 +46,9 @@ def element(function: Callable[[Any, Any], Any], parameters: Any, constants: Any
         return function(parameters, constants)
 
     def of_scalars(scalars: Scalars, constants: Any) -> Any:
-        return _tied(function(filled(scalars), constants), scalars)
+        return _mark_dependent(function(filled(scalars), constants), scalars)
 
-    return _of_scalars(of_scalars, scalars, constants)
+    return _evaluate_scalars(of_scalars, scalars, constants)
 
 
 def _scalars_of(parameters: Any, dtype: Any) -> tuple[Scalars, Callable[[Scalars], Any]]:
@@ -214,13 +214,13 @@ def _linear(value: Any, slopes: Any, scalars: Scalars) -> Any:
 
 
 @_linear.defjvp
-@broadcasting
+@allow_broadcasting
 def _linear_jvp(primals: Any, tangents: Any) -> tuple[Any, Any]:
     value, slopes, _ = primals
-    return value, _combined(slopes, tangents[2])
+    return value, _combine(slopes, tangents[2])
 
 
-def _by_itself(function: Callable[[Array], Any], scalars: Scalars, argument: Array) -> Any:
+def _isolate(function: Callable[[Array], Any], scalars: Scalars, argument: Array) -> Any:
     """function(given), formed once: XLA would form what it finds again for every element of whatever uses it.
 
     Barriers are gone by the time that XLA fuses on a processor; what branches give is not fused with anything.
@@ -237,7 +237,7 @@ def _are_numbers(scalars: Scalars) -> Array:
     return reduce(jnp.logical_and, (scalar == scalar for scalar in scalars), jnp.asarray(True))
 
 
-def _tied(arrays: Any, scalars: Scalars) -> Any:
+def _mark_dependent(arrays: Any, scalars: Scalars) -> Any:
     """What was found, all of it a function of the scalars in form, at no cost.
 
     Under `vmap` an output of a custom derivative that does not depend on them would have no batch as a value and one
@@ -248,21 +248,23 @@ def _tied(arrays: Any, scalars: Scalars) -> Any:
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _of_scalars(function: Callable[[Scalars, Any], Any], scalars: Scalars, constants: Any) -> Any:
+def _evaluate_scalars(function: Callable[[Scalars, Any], Any], scalars: Scalars, constants: Any) -> Any:
     return function(scalars, constants)
 
 
-@broadcasting
+@allow_broadcasting
 def _jvp(function: Callable[[Scalars, Any], Any], primals: Any, tangents: Any) -> tuple[Any, Any]:
     scalars, constants = primals
-    value, slope = _by_scalars(function, scalars, constants, tangents[0])
+    value, slope = _differentiate_scalars(function, scalars, constants, tangents[0])
     if tangents[1] is None or isinstance(tangents[1], SymbolicZero):
         return value, slope
     more = jax.jvp(partial(function, scalars), (constants,), (tangents[1],))[1]
     return value, jax.tree.map(jnp.add, slope, more)
 
 
-def _by_scalars(function: Callable[[Scalars, Any], Any], scalars: Scalars, constants: Any, tangents: Any) -> Any:
+def _differentiate_scalars(
+    function: Callable[[Scalars, Any], Any], scalars: Scalars, constants: Any, tangents: Any
+) -> Any:
     """The value, and its derivative along tangents of the scalars."""
     changing = [k for k, tangent in enumerate(tangents) if not isinstance(tangent, SymbolicZero)]
     if not changing:
@@ -272,8 +274,8 @@ def _by_scalars(function: Callable[[Scalars, Any], Any], scalars: Scalars, const
     def slopes(units: Array) -> tuple[Any, Any]:
         return _slopes(lambda scalars: function(scalars, constants), scalars, changing, units)
 
-    value, found = _by_itself(slopes, scalars, jnp.eye(len(changing), dtype=scalars[0].dtype))
-    return value, _combined(found, [tangents[k] for k in changing])
+    value, found = _isolate(slopes, scalars, jnp.eye(len(changing), dtype=scalars[0].dtype))
+    return value, _combine(found, [tangents[k] for k in changing])
 
 
 def _slopes(
@@ -293,7 +295,7 @@ def _slopes(
     return jax.vmap(along, out_axes=(None, 0))(units)
 
 
-def _combined(slopes: Any, rates: Sequence[Array]) -> Any:
+def _combine(slopes: Any, rates: Sequence[Array]) -> Any:
     """The derivative along these rates of the scalars."""
 
     def combined(slopes: Array) -> Array:
@@ -302,4 +304,4 @@ def _combined(slopes: Any, rates: Sequence[Array]) -> Any:
     return jax.tree.map(combined, slopes)
 
 
-_of_scalars.defjvp(_jvp, symbolic_zeros=True)
+_evaluate_scalars.defjvp(_jvp, symbolic_zeros=True)

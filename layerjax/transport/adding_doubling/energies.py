@@ -11,13 +11,13 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jax import Array
 
-from layerjax._numerics import at_least, at_most, horizon, not_negative
-from layerjax.channels import Channels, each, select, times, total
+from layerjax._numerics import clamp_max, clamp_min, clamp_nonnegative, horizon
+from layerjax.channels import Channels, map_channels, multiply, select, total
 from layerjax.directions import Vector, flip
 from layerjax.stack import Interface, Stack
-from layerjax.transport.adding_doubling.facet_light import Normals, refracted_rays
+from layerjax.transport.adding_doubling.facet_scattering import Normals, refracted_rays
 from layerjax.transport.adding_doubling.operators import Layer, Operator, Parts
-from layerjax.transport.adding_doubling.requested import requested_region
+from layerjax.transport.adding_doubling.requested_directions import requested_region
 from layerjax.transport.first_order import FirstOrder, ReflectingInterface
 from layerjax.transport.single_scattering import Media, SingleScattering
 
@@ -25,23 +25,23 @@ LEAST_SHARED = 5e-5
 """Energy below which shares of it are those of light from all directions."""
 
 
-class Face(NamedTuple):
+class OuterFace(NamedTuple):
     """What the layer that light meets first reflects and transmits."""
 
     reflect: Parts
     transmit: Parts
 
 
-def outer_faces(stack: Stack, layers: list[Layer]) -> tuple[Face | None, Face | None]:
+def outer_faces(stack: Stack, layers: list[Layer]) -> tuple[OuterFace | None, OuterFace | None]:
     """The layer that light from above meets first, and from below, where they are interfaces."""
     parts = (*stack.layers, stack.base)
     first, last = layers[0], layers[-1]
-    above = Face(first.reflect_top, first.transmit_down) if isinstance(parts[0], Interface) else None
+    above = OuterFace(first.reflect_top, first.transmit_down) if isinstance(parts[0], Interface) else None
     leaves = stack.base is None and isinstance(stack.layers[-1], Interface)
-    return above, Face(last.reflect_bottom, last.transmit_up) if leaves else None
+    return above, OuterFace(last.reflect_bottom, last.transmit_up) if leaves else None
 
 
-def node_shares(whole: Face, face: Face | None, weight: Array) -> Array:
+def node_shares(whole: OuterFace, face: OuterFace | None, weight: Array) -> Array:
     """For light along every node, (3, channels or 1, directions): of what masking takes at the first face, what does
     not enter after all; of what enters, what leaves on the same side and on the other.
 
@@ -68,7 +68,7 @@ def node_shares(whole: Face, face: Face | None, weight: Array) -> Array:
 
 def _share(part: Array, whole: Array, weight: Array) -> Array:
     """part / whole, where there is little of the whole the mean over directions."""
-    mean = jnp.sum(part * weight, axis=-1, keepdims=True) / at_least(
+    mean = jnp.sum(part * weight, axis=-1, keepdims=True) / clamp_min(
         jnp.sum(whole * weight, axis=-1, keepdims=True), LEAST_SHARED**2 * jnp.sum(weight)
     )
     return (part * whole + LEAST_SHARED**2 * jnp.clip(mean, 0.0, 1.0)) / (whole * whole + LEAST_SHARED**2)
@@ -81,20 +81,20 @@ def directional_albedo(
     single = SingleScattering()
     sides = [(first.upper, wi)] + ([] if first.lower is None else [(first.lower, flip(wi))])
     once = total([single.albedo(media, w, nodes)[0] for media, w in sides])
-    lost = total([(_lost(media, w, once[0], nodes),) for media, w in sides])
-    near, far = none_negative(*shares[1:])
-    stays = each(
-        lambda once, lost, out: at_most(at_least(lost * out, 0.0), at_least(1.0 - once, 0.0)), once, lost, shares[0]
+    lost = total([(_masking_loss(media, w, once[0], nodes),) for media, w in sides])
+    near, far = clip_negative(*shares[1:])
+    stays = map_channels(
+        lambda once, lost, out: clamp_max(clamp_min(lost * out, 0.0), clamp_min(1.0 - once, 0.0)), once, lost, shares[0]
     )
-    inside = each(lambda once, stays: at_least(1.0 - once - stays, 0.0), once, stays)
-    parts = [once, times(inside, near)] + ([stays] if multiple else [])  # else masking absorbs it
+    inside = map_channels(lambda once, stays: clamp_min(1.0 - once - stays, 0.0), once, stays)
+    parts = [once, multiply(inside, near)] + ([stays] if multiple else [])  # else masking absorbs it
     visible = jnp.abs(wi[2]) > horizon(wi[2].dtype)
     if first.lower is None:
         visible = visible & (wi[2] > 0)
-    return select(visible, total(parts)), select(visible, times(inside, far))
+    return select(visible, total(parts)), select(visible, multiply(inside, far))
 
 
-def _lost(media: Media, w: Vector, reflected: Array, nodes: int) -> Array:
+def _masking_loss(media: Media, w: Vector, reflected: Array, nodes: int) -> Array:
     """Energy that masking takes at a face which is the first that light along w meets; else 0."""
     face = media.base
     if media.media or not isinstance(face, ReflectingInterface):
@@ -103,13 +103,13 @@ def _lost(media: Media, w: Vector, reflected: Array, nodes: int) -> Array:
     region = requested_region(jnp.where(above, w[2], 0.5).ravel(), jnp.ones_like(face.ior))
     _, passed = refracted_rays(region, face.ior, Normals(face.alpha, face.distribution), (nodes, max(2, nodes // 2)))
     refracted = jnp.sum(passed, axis=-1).reshape(w[2].shape)
-    return jnp.where(above, at_least(1.0 - reflected - refracted, 0.0), 0.0)
+    return jnp.where(above, clamp_min(1.0 - reflected - refracted, 0.0), 0.0)
 
 
-def none_negative(near: Channels, far: Channels) -> tuple[Channels, Channels]:
+def clip_negative(near: Channels, far: Channels) -> tuple[Channels, Channels]:
     """Two energies, none below 0: what interpolation takes one below it is the other's, and their sum is kept."""
 
     def balanced(one: Array, other: Array) -> Array:
-        return not_negative(not_negative(one) + (other - not_negative(other)))
+        return clamp_nonnegative(clamp_nonnegative(one) + (other - clamp_nonnegative(other)))
 
-    return each(balanced, near, far), each(balanced, far, near)
+    return map_channels(balanced, near, far), map_channels(balanced, far, near)

@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from layerjax._numerics import at_least, at_most, horner, safe_sqrt, smooth_step
+from layerjax._numerics import clamp_max, clamp_min, horner, safe_sqrt, smooth_step
 from layerjax.quadrature import gauss_legendre
 from layerjax.transport.adding_doubling.interpolate import cubic
 
@@ -31,13 +31,13 @@ COSINE_FLOOR = 1e-7
 LEAST_COSINE = 1e-6
 """Stands for the cosine 0 at the end of a table."""
 
-MERGED = 0.5
+MERGE_SHARE = 0.5
 """Of the first node of a panel: indices whose squares differ by less than its square share one panel."""
 
 UNROLLED = 8
 """Polynomials of up to so many degrees are written out, of more a loop."""
 
-NEAR = 0.3
+EDGE_SHARE = 0.3
 """Largest share of a panel around its edge."""
 
 ROUNDED_ROOT = (367 / 928, 151 / 232, 23 / 464, -31 / 232, 35 / 928)
@@ -95,7 +95,7 @@ class Grid(eqx.Module):
         return np.arange(self.edges.shape[0])[:, None]
 
 
-def joined(first: Region, second: Region) -> Region:
+def join_regions(first: Region, second: Region) -> Region:
     """The directions of two regions of one index, one after the other."""
     parts = jax.tree.map(lambda a, b: jnp.concatenate([jnp.atleast_1d(a), jnp.atleast_1d(b)]), first, second)
     return eqx.tree_at(lambda region: region.ior, parts, first.ior)
@@ -115,8 +115,8 @@ def make_grid(indices: Sequence[Any], ranks: tuple[int, ...] | None, nodes: int,
     else:
         edges = jnp.stack([squares[ranks.index(rank)] for rank in range(max(ranks) + 1)])
     x, w = (jnp.asarray(array, dtype) for array in gauss_legendre(nodes))
-    least_width = (MERGED * x[0]) ** 2
-    grid = Grid(_merged(edges, least_width), least_width, (), nodes)
+    least_width = (MERGE_SHARE * x[0]) ** 2
+    grid = Grid(_merge_edges(edges, least_width), least_width, (), nodes)
     x2 = (x * x)[None]
     regions = []
     for n2 in squares:
@@ -124,7 +124,7 @@ def make_grid(indices: Sequence[Any], ranks: tuple[int, ...] | None, nodes: int,
         width = high - low
         exists = (high <= n2) & (width > 0)
         cosine2 = jnp.where(exists, (n2 - high + x2 * width) / n2, 0.25)
-        cosine = jnp.sqrt(at_least(cosine2, COSINE_FLOOR**2))
+        cosine = jnp.sqrt(clamp_min(cosine2, COSINE_FLOOR**2))
         sine = jnp.sqrt(jnp.where(exists, (high - x2 * width) / n2, 0.75))
         here = jnp.where(exists, (x * w)[None] * width, 0.0)
         flat = (cosine.ravel(), sine.ravel(), here.ravel(), (here / (n2 * cosine)).ravel(), here.ravel() > 0)
@@ -132,7 +132,7 @@ def make_grid(indices: Sequence[Any], ranks: tuple[int, ...] | None, nodes: int,
     return eqx.tree_at(lambda g: g.regions, grid, tuple(regions))
 
 
-def _merged(edges: Array, least_width: Array) -> Array:
+def _merge_edges(edges: Array, least_width: Array) -> Array:
     """The edges, each moved up to the next one if that is nearer than `least_width`.
 
     Between indices that nearly agree a panel of its own would hold no node that counts, and the values would change
@@ -144,7 +144,7 @@ def _merged(edges: Array, least_width: Array) -> Array:
     return jnp.stack(merged)
 
 
-def spread(grid: Grid, ior: Array, cosine: Array, sine2: Array, blur: Array) -> Array:
+def interpolation_weights(grid: Grid, ior: Array, cosine: Array, sine2: Array, blur: Array) -> Array:
     """Interpolation weights of directions on all nodes, shape ``cosine.shape + (grid.size,)``, which sum to 1.
 
     Polynomials of the panel's coordinate. Summed against a distribution of directions they *deposit* it on the nodes,
@@ -165,7 +165,7 @@ def spread(grid: Grid, ior: Array, cosine: Array, sine2: Array, blur: Array) -> 
     for k in range(grid.edges.shape[0]):
         low, high = grid.bounds(np.asarray(k), squared_index)
         width = jnp.where(high > low, high - low, 1.0)
-        above = _around(grid, squared_index, k, blur)
+        above = _edge_width(grid, squared_index, k, blur)
         x2 = ((high - squared_index) + squared_index * cosine * cosine) / width
         x = _coordinate_between(x2, (squared - low) / width, below / width, above / width)
         reached.append(_step(squared - grid.edges[k], above, grid.edges[k] < squared_index - grid.least_width))
@@ -175,7 +175,7 @@ def spread(grid: Grid, ior: Array, cosine: Array, sine2: Array, blur: Array) -> 
     return jnp.concatenate(placed, axis=-1)
 
 
-def _around(grid: Grid, squared_index: Array, k: int, blur: Array) -> Array:
+def _edge_width(grid: Grid, squared_index: Array, k: int, blur: Array) -> Array:
     """Half the width of what is around the upper edge of a panel; 0 where there is none in the region."""
     if k + 1 == grid.edges.shape[0]:
         return jnp.zeros_like(squared_index)
@@ -186,7 +186,7 @@ def _around(grid: Grid, squared_index: Array, k: int, blur: Array) -> Array:
         before = jnp.where(grid.edges[other] < edge, grid.edges[other], before)
     return jnp.where(
         edge < squared_index - grid.least_width,
-        at_most(at_most(blur[k], NEAR * (edge - before)), NEAR * (after - edge)),
+        clamp_max(clamp_max(blur[k], EDGE_SHARE * (edge - before)), EDGE_SHARE * (after - edge)),
         0.0,
     )
 
@@ -205,12 +205,12 @@ def _coordinate_between(x2: Array, rest2: Array, below: Array, above: Array) -> 
     """
     wide, t = below > 0, rest2 / jnp.where(below > 0, below, 1.0)
     near = wide & (t < 1.0)
-    t = jnp.where(near, at_least(t, -1.0), 0.0)
+    t = jnp.where(near, clamp_min(t, -1.0), 0.0)
     x2 = jnp.where(near, 1.0 - below * (1.0 + t) ** 3 * (3.0 - t) / 16.0, x2)
     wide, r = above > 0, x2 / jnp.where(above > 0, above, 1.0)
     near = wide & (r < 1.0)
-    rounded = jnp.sqrt(jnp.where(wide, above, 1.0)) * horner(ROUNDED_ROOT, jnp.where(near, at_least(r, -1.0), 0.0))
-    return jnp.where(near, rounded, safe_sqrt(jnp.where(near, 1.0, at_most(at_least(x2, 0.0), 1.0))))
+    rounded = jnp.sqrt(jnp.where(wide, above, 1.0)) * horner(ROUNDED_ROOT, jnp.where(near, clamp_min(r, -1.0), 0.0))
+    return jnp.where(near, rounded, safe_sqrt(jnp.where(near, 1.0, clamp_max(clamp_min(x2, 0.0), 1.0))))
 
 
 def _panel(grid: Grid, squared: Array) -> Array:
@@ -223,7 +223,7 @@ def _coordinate(ior: Array, cosine: Array, sine2: Array, low: Array, high: Array
     n2 = ior * ior
     width = jnp.where(high > low, high - low, 1.0)
     x2 = ((high - n2) + n2 * cosine * cosine) / width
-    return at_most(at_least(x2, 0.0), 1.0), at_most(at_least((n2 * sine2 - low) / width, 0.0), 1.0)
+    return clamp_max(clamp_min(x2, 0.0), 1.0), clamp_max(clamp_min((n2 * sine2 - low) / width, 0.0), 1.0)
 
 
 def lagrange(x: Array, nodes: int) -> Array:
@@ -286,7 +286,7 @@ def stencil(grid: Grid, ior: Array, cosine: Array, sine2: Array) -> tuple[Array,
     return first.astype(jnp.int32) + panel * points, place - first
 
 
-def interpolated(grid: Grid, rows: Array, ior: Array, cosine: Array, sine2: Array) -> Array:
+def interpolate_rows(grid: Grid, rows: Array, ior: Array, cosine: Array, sine2: Array) -> Array:
     """Row of a table (points, columns) at directions, shape ``cosine.shape + (columns,)``; see `stencil`."""
     first, place = stencil(grid, ior, cosine, sine2)
     weights = cubic(place)
@@ -301,13 +301,13 @@ def table_region(grid: Grid, region: Region) -> Region:
     rest = jnp.asarray(x * x, high.dtype) * (high - low)
     exists = (high <= squared_index) & (high > low)
     cosine = jnp.sqrt(
-        at_least(jnp.where(exists, (squared_index - high + rest) / squared_index, 1.0), LEAST_COSINE**2)
+        clamp_min(jnp.where(exists, (squared_index - high + rest) / squared_index, 1.0), LEAST_COSINE**2)
     ).ravel()
     one = jnp.ones_like(cosine)
     return Region(region.ior, cosine, safe_sqrt((1.0 - cosine) * (1.0 + cosine)), one, one, one > 0)
 
 
-def at_table_points(grid: Grid, values: Array) -> Array:
+def table_values(grid: Grid, values: Array) -> Array:
     """Values (..., nodes) at the points of a table, by polynomials in each panel."""
     _, matrix = table_matrix(grid.nodes)
     split = values.reshape(*values.shape[:-1], -1, grid.nodes) @ jnp.asarray(matrix.T, values.dtype)

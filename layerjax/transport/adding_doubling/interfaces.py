@@ -2,7 +2,8 @@
 
 What a face reflects is its BRDF at the nodes, scaled to the energy that its visible facets reflect. What it refracts
 is found facet by facet: those visible from a node are integrated over by quadrature, and what each passes is put
-(*deposited*) on the nodes around (see `grid.spread`). The energy is that of the quadrature at any roughness.
+(*deposited*) on the nodes around (see `grid.interpolation_weights`). The energy is that of the quadrature at any
+roughness.
 """
 
 from collections.abc import Sequence
@@ -14,24 +15,24 @@ import numpy as np
 from jax import Array
 
 from layerjax import fresnel
-from layerjax._batching import by_rows
-from layerjax._numerics import at_least, at_most, safe_div, safe_sqrt
+from layerjax._batching import map_row_chunks
+from layerjax._numerics import clamp_max, clamp_min, safe_div, safe_sqrt
 from layerjax.directions import Vector, half_vector
 from layerjax.microsurface.directional_albedo import interface_energies
 from layerjax.surfaces.microfacet import mirror_lobe
-from layerjax.transport.adding_doubling.facet_light import (
+from layerjax.transport.adding_doubling.facet_scattering import (
     Normals,
+    dense_refracted_rays,
     facet_energies,
     facet_spacing,
     polar_count,
     reflected_energy,
-    refracted_densely,
     refracted_rays,
 )
-from layerjax.transport.adding_doubling.grid import Grid, Region, joined, spread
+from layerjax.transport.adding_doubling.grid import Grid, Region, interpolation_weights, join_regions
 from layerjax.transport.adding_doubling.inverse import inverse
 from layerjax.transport.adding_doubling.operators import Layer, Parts
-from layerjax.transport.adding_doubling.sampling import azimuths, cosines, modes_at_nodes, scaled_to_energy
+from layerjax.transport.adding_doubling.sampling import azimuths, cosines, modes_at_nodes, scale_to_energy
 
 NextEvent = Literal["diffuse", "narrow", "faces"]
 """Of an interface: what turns light into all directions, so that none is ballistic; what does not; or other faces
@@ -43,13 +44,13 @@ STRONG = 5.0
 LEAST_POINTS = {"ggx": (12, 6), "vmf": (12, 8)}
 """Points a panel, and in azimuth, of light let in along few directions, at least, by the distribution of normals."""
 
-AT_ONCE = 1 << 20
+MOST_ENTRIES = 1 << 20
 """Numbers that arrays of facets hold at most."""
 
-ROUNDED = 0.01
+ROUNDING_SHARE = 0.01
 """Times the root of the precision: a share of energy below it is only what rounding leaves of tables."""
 
-RESOLVED = 0.2
+HALF_RESOLVED_WIDTH = 0.2
 """Times the distance between nodes: a lobe of this width, alpha times their number, is half resolved by them."""
 
 BLUR, BLUR_BETWEEN = 5.6, 2.5
@@ -103,11 +104,11 @@ def interface_layer(
     if requested is None:
         operators = _operators(grid, near, far, normals, modes, multiple, next_event)
     elif not multiple:
-        operators = _followed(grid, requested, far, normals, modes, next_event)
+        operators = _requested_operators(grid, requested, far, normals, modes, next_event)
     else:  # what masking loses is returned in proportion to sums over all directions outside
         operators = _operators(
             grid,
-            joined(requested, near),
+            join_regions(requested, near),
             far,
             normals,
             modes,
@@ -115,11 +116,11 @@ def interface_layer(
             next_event,
             requested.weight.size,
         )
-    outer, into, out, inner = (_channelled(parts) for parts in operators)
+    outer, into, out, inner = (_add_channel_axis(parts) for parts in operators)
     return Layer(outer, inner, into, out) if enters else Layer(inner, outer, out, into)
 
 
-def _channelled(parts: Parts) -> Parts:
+def _add_channel_axis(parts: Parts) -> Parts:
     return Parts(*(None if operator is None else operator[None] for operator in (parts.first, parts.rest)))
 
 
@@ -141,9 +142,9 @@ def _operators(
     inside, up, lost_inside = facet_energies(far, near, normals)
     unsampled_share = _unsampled_share(grid, normals)
     through = _deposit(
-        grid, *refracted_densely(grid, near, far, normals, modes), far, near, modes, _blur(grid, near, far, normals)
+        grid, *dense_refracted_rays(grid, near, far, normals, modes), far, near, modes, _blur(grid, near, far, normals)
     )
-    through = _balanced(through, near, far, *_agreed(near, far, (down, up), (outside, inside)))
+    through = _balance_flux(through, near, far, *_reconcile_energies(near, far, (down, up), (outside, inside)))
     leaving = jnp.where(np.arange(near.weight.size) < requested, 1.0, near.weight)
     outer = None
     if not requested:
@@ -154,25 +155,27 @@ def _operators(
         far, inside, rest, unsampled_share, near.ior / far.ior, normals, modes, _trapped_blur(grid, next_event)
     )
     once: list[Array | None] = [outer, through, _adjoint(through, leaving, far), inner]
-    returned: list[Array | None] = [None] * 4
+    compensation: list[Array | None] = [None] * 4
     if multiple:
-        turned = [
-            _turned_back(a, b.ior / a.ior, normals.alpha, level, lost)
+        reflected = [
+            _multiple_reflected_energy(a, b.ior / a.ior, normals.alpha, level, lost)
             for a, b, level, lost in ((near, far, outside, lost_outside), (far, near, inside, lost_inside))
         ]
-        gains = _given_back((lost_outside, lost_inside), turned, (near.weight, far.weight), (leaving, far.weight))
-        returned = [jnp.zeros((modes, *gain.shape), gain.dtype).at[0].set(gain) for gain in gains]
-    found = list(map(Parts, once, returned))
-    return [_of_requested(parts, place, requested) for place, parts in enumerate(found)] if requested else found
+        gains = _energy_compensation(
+            (lost_outside, lost_inside), reflected, (near.weight, far.weight), (leaving, far.weight)
+        )
+        compensation = [jnp.zeros((modes, *gain.shape), gain.dtype).at[0].set(gain) for gain in gains]
+    found = list(map(Parts, once, compensation))
+    return [_select_requested(parts, place, requested) for place, parts in enumerate(found)] if requested else found
 
 
-def _of_requested(parts: Parts, place: int, requested: int) -> Parts:
+def _select_requested(parts: Parts, place: int, requested: int) -> Parts:
     """The first `requested` directions outside alone: outer reflection, light that enters, that leaves, inner one."""
     rows, columns = (requested if place in (0, 2) else None), (requested if place in (0, 1) else None)
     return Parts(*(None if part is None else part[:, :rows, :columns] for part in (parts.first, parts.rest)))
 
 
-def _followed(
+def _requested_operators(
     grid: Grid, requested: Region, inner: Region, normals: Normals, modes: int, next_event: NextEvent
 ) -> list[Parts]:
     """The four operators (see `_operators`) for requested directions, where what masking loses is lost: no sum over
@@ -183,7 +186,7 @@ def _followed(
         points = max(least[0], grid.nodes), max(least[1], modes // 2)
         rays = refracted_rays(requested, ratio, normals, points)
     else:
-        rays = refracted_densely(grid, requested, inner, normals, modes)
+        rays = dense_refracted_rays(grid, requested, inner, normals, modes)
     through = _deposit(grid, *rays, inner, requested, modes, _blur(grid, requested, inner, normals))
     inside = reflected_energy(inner, 1.0 / ratio, normals)
     back = _adjoint(through, jnp.ones_like(requested.weight), inner)
@@ -192,11 +195,11 @@ def _followed(
 
 
 def _unsampled_share(grid: Grid, normals: Normals) -> Array:
-    return 1.0 / (1.0 + (jnp.asarray(normals.alpha) * grid.nodes / RESOLVED) ** 4)
+    return 1.0 / (1.0 + (jnp.asarray(normals.alpha) * grid.nodes / HALF_RESOLVED_WIDTH) ** 4)
 
 
 def _blur(grid: Grid, near: Region, far: Region, normals: Normals) -> Array:
-    """See `spread`: none where nodes do not resolve the lobe, for refraction sends them to nodes there.
+    """See `interpolation_weights`: none where nodes do not resolve the lobe, for refraction sends them to nodes there.
 
     Between several interfaces no wider than rays are apart: light that is kept there by total reflection meets the edge
     again and again. As wide as for a single one, a clear slab of index 1.2 and alpha 0.5 would be off by 4e-3.
@@ -213,14 +216,14 @@ def _face(region: Region, energy: Array, ior: Array, normals: Normals, modes: in
 
     Light that two interfaces reflect totally would go back and forth for ever: a little is lost.
     """
-    energy = at_most(energy, 1.0 - LEAK * float(jnp.finfo(energy.dtype).eps))
+    energy = clamp_max(energy, 1.0 - LEAK * float(jnp.finfo(energy.dtype).eps))
 
     def reflection(wi: Vector, wo: Vector) -> list[Array]:
         h, cosine = half_vector(wi, wo, same_side=True)
         level = fresnel.dielectric(cosine, ior, _critical_blur(wi, wo, ior, np.pi / azimuths(modes), trapped_blur))
         return [level * mirror_lobe(h, wi, wo, *normals)]
 
-    return scaled_to_energy(region, modes_at_nodes(reflection, region, region, modes, has_mirror_lobe=True)[0], energy)
+    return scale_to_energy(region, modes_at_nodes(reflection, region, region, modes, has_mirror_lobe=True)[0], energy)
 
 
 def _trapped_blur(grid: Grid, next_event: NextEvent) -> float:
@@ -238,7 +241,7 @@ def _critical_blur(wi: Vector, wo: Vector, ior: Array, azimuth: float, polar: fl
     squared = (CRITICAL * azimuth) ** 2 * (across * across + (azimuth * along) ** 2)
     if polar:
         cosine = along + wi[2] * wo[2]
-        squared = squared + (CRITICAL_KEPT * polar) ** 2 * at_least((1.0 - cosine) * (1.0 + cosine), 0.0)
+        squared = squared + (CRITICAL_KEPT * polar) ** 2 * clamp_min((1.0 - cosine) * (1.0 + cosine), 0.0)
     return jnp.sqrt(squared) / (2.0 * ior * ior)
 
 
@@ -261,19 +264,19 @@ def _deposit(grid: Grid, wo: Vector, share: Array, far: Region, near: Region, mo
         wo, share = rays
         squared = wo[0] * wo[0] + wo[1] * wo[1]
         planar = safe_sqrt(squared)
-        weights = spread(grid, far.ior, jnp.abs(wo[2]), squared, blur)
+        weights = interpolation_weights(grid, far.ior, jnp.abs(wo[2]), squared, blur)
         waves = cosines(jnp.where(squared > 0, wo[0] / jnp.where(squared > 0, planar, 1.0), 1.0), modes)
         spun = waves * jnp.where(odd[:, None], share * planar, share)
         return spun @ weights
 
     rows, points = share.shape
-    chunks = points * max(modes, grid.size) * rows // AT_ONCE
-    flux = jnp.moveaxis(by_rows(jax.vmap(deposit), (wo, share), chunks), 0, -1)
+    chunks = points * max(modes, grid.size) * rows // MOST_ENTRIES
+    flux = jnp.moveaxis(map_row_chunks(jax.vmap(deposit), (wo, share), chunks), 0, -1)
     flux = flux / jnp.where(odd[:, None], far.sine, 1.0)[:, :, None]
     return jnp.where(far.weight[:, None] > 0, flux, 0.0)
 
 
-def _balanced(flux: Array, near: Region, far: Region, down: Array, up: Array) -> Array:
+def _balance_flux(flux: Array, near: Region, far: Region, down: Array, up: Array) -> Array:
     """Deposited flux F, changed least so that it passes the energy `down` of light from near nodes, and its adjoint
     `up` from far ones.
 
@@ -283,11 +286,11 @@ def _balanced(flux: Array, near: Region, far: Region, down: Array, up: Array) ->
     """
     up = up * far.weight
     typical = safe_div(jnp.outer(up, down), jnp.sum(up))
-    sign = flux[0] / safe_sqrt(flux[0] ** 2 + at_least(LITTLE * typical, TINY) ** 2)  # without a step
+    sign = flux[0] / safe_sqrt(flux[0] ** 2 + clamp_min(LITTLE * typical, TINY) ** 2)  # without a step
     size = flux[0] * sign
     crossing = size * near.weight
     ridge = max(RIDGE, np.sqrt(jnp.finfo(size.dtype).eps))
-    rows = at_least(jnp.sum(crossing, axis=1) + ridge * up, TINY)
+    rows = clamp_min(jnp.sum(crossing, axis=1) + ridge * up, TINY)
     columns = jnp.sum(crossing, axis=0) + ridge * down * near.weight
     missing = up - flux[0] @ near.weight
     # rows are eliminated: columns alone are left
@@ -300,21 +303,21 @@ def _balanced(flux: Array, near: Region, far: Region, down: Array, up: Array) ->
     return flux * (1.0 + sign * (of_nodes + b))
 
 
-def _agreed(
+def _reconcile_energies(
     near: Region, far: Region, energies: tuple[Array, Array], reflected: tuple[Array, Array]
 ) -> tuple[Array, Array]:
     """Energies that pass both ways, made equal in total: the rest counts as reflected, where much is."""
     down, up = energies
     rest = up @ far.weight - down @ near.weight
-    most = [_most(level) for level in reflected]
+    most = [_largest_correction(level) for level in reflected]
     whole = most[0] @ near.weight + most[1] @ far.weight
-    step = safe_div(rest, at_least(whole, jnp.abs(rest)))
+    step = safe_div(rest, clamp_min(whole, jnp.abs(rest)))
     return down + step * most[0], up - step * most[1]
 
 
-def _most(level: Array) -> Array:
+def _largest_correction(level: Array) -> Array:
     """By how much what is reflected may be changed: a weak reflection by a small share alone."""
-    return level * at_most(STRONG * level, 1.0)
+    return level * clamp_max(STRONG * level, 1.0)
 
 
 def _reflection(
@@ -332,44 +335,44 @@ def _reflection(
     Of an interface that they do not resolve it is reflected like by a mirror, else with the lobe: a weak one is left as
     it is, and may change by a larger share the stronger it is.
     """
-    most = _most(level)
-    resolved = (1.0 - unsampled_share) * at_most(at_least(rest, -most), most)
+    most = _largest_correction(level)
+    resolved = (1.0 - unsampled_share) * clamp_max(clamp_min(rest, -most), most)
     lobe = _face(region, level + resolved, ior, normals, modes, trapped_blur)
-    return lobe + unsampled_share * jnp.diag(at_least(rest, -level))
+    return lobe + unsampled_share * jnp.diag(clamp_min(rest, -level))
 
 
-def _turned_back(region: Region, ratio: Array, alpha: Array, once: Array, lost: Array) -> Array:
+def _multiple_reflected_energy(region: Region, ratio: Array, alpha: Array, once: Array, lost: Array) -> Array:
     """Share of the energy lost to masking that is reflected, by the walk on the microsurface (Heitz et al. 2016)."""
     exists = region.exists
     level, _ = interface_energies(jnp.where(exists, region.cosine, 0.5), alpha, ratio, multiple=True)
-    gain = at_least(level - once, 0.0)
+    gain = clamp_min(level - once, 0.0)
     return jnp.where(exists, jnp.where(gain < lost, gain, lost), 0.0)
 
 
-def _given_back(
-    lost: tuple[Array, Array], turned: Sequence[Array], weights: tuple[Array, Array], leaving: tuple[Array, Array]
+def _energy_compensation(
+    lost: tuple[Array, Array], reflected: Sequence[Array], weights: tuple[Array, Array], leaving: tuple[Array, Array]
 ) -> list[Array]:
     """What the four operators gain when energy lost to masking is returned (after Kulla & Conty 2017), both sides.
 
     What is reflected, r, comes back diffusely as r r' / <r>, and what crosses, t, as t t' / <t>: reciprocal,
     and all that is lost returns. As much must cross one way as the other; where the two differ, the smaller decides.
     """
-    crossing = [l - r for l, r in zip(lost, turned, strict=True)]
+    crossing = [l - r for l, r in zip(lost, reflected, strict=True)]
     sums = [jnp.sum(weight * t) for weight, t in zip(weights, crossing, strict=True)]
     least = jnp.where(sums[0] < sums[1], sums[0], sums[1])
     crossing = [t * safe_div(least, total) for t, total in zip(crossing, sums, strict=True)]
     down, up = (
         safe_div(jnp.outer(leaving[out] * crossing[out], crossing[into]), least) for out, into in ((1, 0), (0, 1))
     )
-    near, far = (_staying(*side) for side in zip(lost, crossing, weights, leaving, strict=True))
+    near, far = (_diffuse_compensation(*side) for side in zip(lost, crossing, weights, leaving, strict=True))
     return [near, down, up, far]
 
 
-def _staying(lost: Array, crossing: Array, weight: Array, leaving: Array) -> Array:
+def _diffuse_compensation(lost: Array, crossing: Array, weight: Array, leaving: Array) -> Array:
     """What is reflected. Where nothing is, at equal indices, it comes back like all that is lost:
     the product has no derivative there, and energy needs one."""
-    staying = lost - crossing
-    mean, whole = jnp.sum(weight * staying), jnp.sum(weight * lost)
-    some = mean > ROUNDED * np.sqrt(jnp.finfo(mean.dtype).eps) * whole
-    profile = jnp.where(some, staying / jnp.where(some, mean, 1.0), safe_div(lost, whole))
-    return jnp.outer(leaving * profile, staying)
+    reflected = lost - crossing
+    mean, whole = jnp.sum(weight * reflected), jnp.sum(weight * lost)
+    some = mean > ROUNDING_SHARE * np.sqrt(jnp.finfo(mean.dtype).eps) * whole
+    profile = jnp.where(some, reflected / jnp.where(some, mean, 1.0), safe_div(lost, whole))
+    return jnp.outer(leaving * profile, reflected)

@@ -16,7 +16,7 @@ from jax import Array
 
 from layerjax.channels import Channels
 
-TOGETHER = 2
+AXES_PER_STEP = 2
 """Axes whose entries a step of the loop reads. All three in one step are a little faster by themselves, but XLA then
 does them again for each that uses the value, and a gradient takes five times as long.
 """
@@ -48,7 +48,7 @@ def cubic(place: Array) -> tuple[Array, Array, Array, Array]:
 def look_up(tables: Sequence[Array], start: Array, axes: Sequence[Axis]) -> Channels:
     """Values of tables that share their shape; start: added to the place in the flat table."""
     flat = [table.reshape(-1) for table in tables]
-    outer, inner = axes[:-TOGETHER], axes[-TOGETHER:]
+    outer, inner = axes[:-AXES_PER_STEP], axes[-AXES_PER_STEP:]
     shape = jnp.broadcast_shapes(start.shape, *(axis.place.shape for axis in axes))
     zero = jnp.zeros(shape, axes[0].place.dtype)
 
@@ -58,7 +58,7 @@ def look_up(tables: Sequence[Array], start: Array, axes: Sequence[Axis]) -> Chan
             place = place + axis.offset(k)
             *others, last = cubic(axis.place)
             weight = weight * jnp.select([k == each for each in range(3)], others, last)
-        found = (_summed(entries, place, inner) for entries in flat)
+        found = (_sum_taps(entries, place, inner) for entries in flat)
         return tuple(total + weight * more for total, more in zip(sums, found, strict=True)), None
 
     every = np.asarray(list(itertools.product(range(4), repeat=len(outer))), np.int32)
@@ -67,10 +67,10 @@ def look_up(tables: Sequence[Array], start: Array, axes: Sequence[Axis]) -> Chan
     return jax.lax.scan(step, (zero,) * len(flat), jnp.asarray(every))[0]
 
 
-def _summed(entries: Array, place: Array, axes: Sequence[Axis]) -> Array:
+def _sum_taps(entries: Array, place: Array, axes: Sequence[Axis]) -> Array:
     """Sum of the entries at a place and the offsets of all axes, times their weights."""
     if not axes:
         return entries.at[place].get(mode="promise_in_bounds")
     axis, *rest = axes
-    parts = [w * _summed(entries, place + axis.offset(k), rest) for k, w in enumerate(cubic(axis.place))]
+    parts = [w * _sum_taps(entries, place + axis.offset(k), rest) for k, w in enumerate(cubic(axis.place))]
     return (parts[0] + parts[1]) + (parts[2] + parts[3])

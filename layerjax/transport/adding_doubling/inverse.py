@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from layerjax._numerics import broadcasting
+from layerjax._numerics import allow_broadcasting
 
 BLOCK = 8
 """Rows that are eliminated together: the rest is a matrix product."""
@@ -33,7 +33,7 @@ def inverse(matrix: Array) -> Array:
 
 
 @inverse.defjvp
-@broadcasting
+@allow_broadcasting
 def _inverse_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
     result = inverse(*primals)
     return result, -result @ tangents[0] @ result

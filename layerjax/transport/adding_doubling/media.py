@@ -15,14 +15,14 @@ import numpy as np
 from jax import Array
 
 from layerjax import fresnel
-from layerjax._numerics import decay_between, exprel, safe_div, safe_sqrt
+from layerjax._numerics import exprel, mean_decay, safe_div, safe_sqrt
 from layerjax.channels import per_channel
 from layerjax.directions import Vector, half_vector
 from layerjax.phase import PhaseFunction
 from layerjax.stack import Medium, is_known
 from layerjax.transport.adding_doubling.grid import Region
-from layerjax.transport.adding_doubling.moments import Terms, kernel_of_moments, truncated
-from layerjax.transport.adding_doubling.operators import Layer, Operator, Parts, double, matmul, turned
+from layerjax.transport.adding_doubling.moments import MomentCounts, kernel_of_moments, truncate
+from layerjax.transport.adding_doubling.operators import Layer, Operator, Parts, double, matmul, rotate
 from layerjax.transport.adding_doubling.sampling import balance, ballistic_share, modes_at_nodes
 from layerjax.transport.adding_doubling.slab import slab
 
@@ -46,7 +46,7 @@ class Kernel(eqx.Module):
     `schlick`: the same times (1 - |wi . h|)^5, if the medium has a Fresnel term. `solid` is the weight of dmu dphi over
     2 pi, `turn` takes azimuths by half a turn (modes: nothing).
 
-    onward: share of a collision that is ballistic, in neither, (nodes,); the same of `schlick`.
+    ballistic: share of a collision that is ballistic, in neither, (nodes,); the same of `schlick`.
     """
 
     plain: Pair
@@ -56,11 +56,11 @@ class Kernel(eqx.Module):
     cosine: Array
     solid: Array
     azimuths: int | None = eqx.field(static=True)
-    onward: tuple[Array, Array] | None = None
+    ballistic: tuple[Array, Array] | None = None
 
     def turn(self, operator: Operator) -> Operator:
         """An operator lit from above to the same lit from below: the medium is its own image under inversion."""
-        return turned(operator, self.azimuths)
+        return rotate(operator, self.azimuths)
 
     def turn_rows(self, operator: Array) -> Array:
         """An operator whose outgoing directions are turned by half a turn about the normal."""
@@ -74,31 +74,31 @@ class Kernel(eqx.Module):
         return jnp.roll(split, self.azimuths // 2, axis=-1).reshape(values.shape)
 
 
-def kernel_modes(phase: PhaseFunction, with_schlick: bool, region: Region, modes: int, carried: Terms) -> Kernel:
+def kernel_modes(phase: PhaseFunction, with_schlick: bool, region: Region, modes: int, carried: MomentCounts) -> Kernel:
     """Kernel of a medium that is symmetric about the normal, as Fourier modes cos(m phi) in the azimuth of travel.
 
     carried: moments, if the phase function has any.
     """
     area = phase.cross_section((region.sine, jnp.zeros_like(region.sine), region.cosine))
     if phase.moments(1) is not None:
-        return _by_moments(phase, with_schlick, region, modes, carried, area)
-    truncated_kernel = modes_at_nodes(lambda wi, wo: _both_sides(phase, with_schlick, wi, wo), region, region, modes)
+        return _kernel_by_moments(phase, with_schlick, region, modes, carried, area)
+    truncated_kernel = modes_at_nodes(lambda wi, wo: _kernel_values(phase, with_schlick, wi, wo), region, region, modes)
     plain, schlick = (
         (truncated_kernel[0], truncated_kernel[1]),
         (truncated_kernel[2], truncated_kernel[3]) if with_schlick else None,
     )
-    return _balanced(Kernel(plain, schlick, area, region.cosine, region.solid, None))
+    return _balance(Kernel(plain, schlick, area, region.cosine, region.solid, None))
 
 
-def _by_moments(
-    phase: PhaseFunction, with_schlick: bool, region: Region, modes: int, carried: Terms, area: Array
+def _kernel_by_moments(
+    phase: PhaseFunction, with_schlick: bool, region: Region, modes: int, carried: MomentCounts, area: Array
 ) -> Kernel:
     """What quadrature misses, where there is more than one panel, counts as ballistic as well."""
     weight = 2.0 * jnp.pi * region.solid
     turned_round = jnp.asarray((-1.0) ** np.arange(modes), weight.dtype)[:, None, None]
 
     def truncated_kernel(is_schlick: bool) -> tuple[Pair, Array]:
-        chi, onward, back = truncated(phase, is_schlick, carried, weight.dtype)
+        chi, onward, back = truncate(phase, is_schlick, carried, weight.dtype)
         reflect, transmit = kernel_of_moments(chi, region.cosine, region.sine, modes)
         return (reflect + turned_round * ballistic_share(back * jnp.ones_like(weight), weight), transmit), onward
 
@@ -117,14 +117,14 @@ def kernel_ordinates(phase: PhaseFunction, with_schlick: bool, region: Region, a
     travel = (sine * jnp.cos(azimuth), sine * jnp.sin(azimuth), cosine)
     wi = (-travel[0][None], -travel[1][None], travel[2][None])
     wo = (travel[0][:, None], travel[1][:, None], travel[2][:, None])
-    found = [value[None] for value in _both_sides(phase, with_schlick, wi, wo)]
+    found = [value[None] for value in _kernel_values(phase, with_schlick, wi, wo)]
     plain, schlick = (found[0], found[1]), (found[2], found[3]) if with_schlick else None
     area = phase.cross_section((-travel[0], -travel[1], travel[2]))
     solid = jnp.repeat(region.solid, azimuths) / azimuths
-    return _balanced(Kernel(plain, schlick, area, cosine, solid, azimuths))
+    return _balance(Kernel(plain, schlick, area, cosine, solid, azimuths))
 
 
-def _both_sides(phase: PhaseFunction, with_schlick: bool, wi: Vector, wo: Vector) -> list[Array]:
+def _kernel_values(phase: PhaseFunction, with_schlick: bool, wi: Vector, wo: Vector) -> list[Array]:
     """Kernel in reflection and transmission, and if there is a Fresnel term both times (1 - |wi . h|)^5."""
     plain, schlick = [], []
     for side in (1.0, -1.0):
@@ -137,7 +137,7 @@ def _both_sides(phase: PhaseFunction, with_schlick: bool, wi: Vector, wo: Vector
     return plain + schlick
 
 
-def _balanced(kernel: Kernel) -> Kernel:
+def _balance(kernel: Kernel) -> Kernel:
     """The kernel scaled so that a collision scatters exactly sigma; what is left is ballistic."""
     weight = 2.0 * jnp.pi * kernel.solid
     reflect, transmit = kernel.plain[0][0], kernel.plain[1][0]
@@ -156,28 +156,28 @@ def _balanced(kernel: Kernel) -> Kernel:
 def medium_layer(medium: Medium, kernel: Kernel, doubled: bool | None = None) -> Layer:
     """The medium as a layer: by eigenvectors, or (if None: in single precision) by doublings."""
     thickness = _column(medium.thickness, kernel)
-    kernel = _less_onward(medium, kernel)
+    kernel = _separate_ballistic(medium, kernel)
     direct = _direct(kernel, thickness)
     if is_known(medium.albedo, 0.0):
         return Layer(Parts(None), direct_down=direct, direct_up=kernel.turn_row(direct))
     strength = _strength(medium, kernel)
     if thickness.dtype != jnp.float64 if doubled is None else doubled:
-        return _by_doublings(kernel, strength, thickness, direct)
-    return _by_eigenvectors(kernel, strength, thickness, direct)
+        return _double_slab(kernel, strength, thickness, direct)
+    return _eigen_slab(kernel, strength, thickness, direct)
 
 
-def _less_onward(medium: Medium, kernel: Kernel) -> Kernel:
+def _separate_ballistic(medium: Medium, kernel: Kernel) -> Kernel:
     """The kernel with an extinction, (channels or 1, 1, nodes), without the ballistic part."""
-    if kernel.onward is None or is_known(medium.albedo, 0.0):
+    if kernel.ballistic is None or is_known(medium.albedo, 0.0):
         return kernel
-    onward, fifth = kernel.onward
+    onward, fifth = kernel.ballistic
     if kernel.schlick is not None:
         f0 = _column(medium.f0, kernel)
         onward = f0 * onward + (1.0 - f0) * fifth
     return eqx.tree_at(lambda k: k.area, kernel, kernel.area - _column(medium.albedo, kernel) * onward)
 
 
-def _by_doublings(kernel: Kernel, strength: Pair, thickness: Array, direct: Array) -> Layer:
+def _double_slab(kernel: Kernel, strength: Pair, thickness: Array, direct: Array) -> Layer:
     """The medium doubled up from a thin slab.
 
     How often is decided as it runs: one program does for every thickness.
@@ -185,7 +185,7 @@ def _by_doublings(kernel: Kernel, strength: Pair, thickness: Array, direct: Arra
 
     @jax.checkpoint
     def doubled(rest: Pair, part: Array) -> Pair:
-        once, passed = _once(kernel, strength, part), _direct(kernel, part)
+        once, passed = _single_scattering(kernel, strength, part), _direct(kernel, part)
         parts = Parts(once[0], rest[0]), Parts(once[1], rest[1])
         reflect, transmit = double(*parts, (passed, kernel.turn_row(passed)), kernel.turn)
         assert reflect is not None
@@ -200,12 +200,12 @@ def _by_doublings(kernel: Kernel, strength: Pair, thickness: Array, direct: Arra
     largest = jax.lax.stop_gradient(jnp.max(thickness))
     passed_over = MOST_STEPS - jnp.ceil(jnp.log2(largest / THIN + 1e-30))
     first = depths[jnp.clip(passed_over, 0, MOST_STEPS - 1).astype(jnp.int32)]
-    start = _twice(kernel, strength, thickness * first)
+    start = _repeated_scattering(kernel, strength, thickness * first)
     rest, _ = jax.lax.scan(step, start, depths)
-    return _layer(kernel, _once(kernel, strength, thickness), rest, direct)
+    return _layer(kernel, _single_scattering(kernel, strength, thickness), rest, direct)
 
 
-def _by_eigenvectors(kernel: Kernel, strength: Pair, thickness: Array, direct: Array) -> Layer:
+def _eigen_slab(kernel: Kernel, strength: Pair, thickness: Array, direct: Array) -> Layer:
     """The medium by `slab`, in double precision: single precision would lose conservative media in rounding."""
     root = safe_sqrt(kernel.solid * kernel.cosine)  # 0 for nodes that do not exist in this region
     into = safe_div(jnp.ones_like(root), root)
@@ -215,7 +215,7 @@ def _by_eigenvectors(kernel: Kernel, strength: Pair, thickness: Array, direct: A
     removed = (kernel.area / kernel.cosine)[..., None] * jnp.eye(root.size, dtype=root.dtype)
     half = jnp.broadcast_to(0.5 * thickness[..., 0], jnp.broadcast_shapes(thickness.shape[:-1], back.shape[:-2]))
     reflect, transmit = slab(*jnp.broadcast_arrays(removed - onward + back, removed - onward - back), half)
-    once = _once(kernel, strength, thickness)
+    once = _single_scattering(kernel, strength, thickness)
     scale = root[:, None] * into
     rest = (
         turn(scale * reflect) - once[0],
@@ -237,20 +237,23 @@ def _direct(kernel: Kernel, thickness: Array) -> Array:
     return jnp.exp(-thickness * (kernel.area / kernel.cosine))
 
 
-def _once(kernel: Kernel, strength: Pair, thickness: Array) -> Pair:
+def _single_scattering(kernel: Kernel, strength: Pair, thickness: Array) -> Pair:
     """Flux scattered exactly once by a slab: reflection and transmission."""
     gain, depth = _depths(kernel, thickness)
     into, down, up = depth[..., None, :], depth[..., :, None], kernel.turn_row(depth)[..., :, None]
     reflect = gain * exprel(up + into)
-    transmit = gain * decay_between(down, into)
+    transmit = gain * mean_decay(down, into)
     return strength[0] * reflect, strength[1] * transmit
 
 
-def _twice(kernel: Kernel, strength: Pair, thickness: Array) -> Pair:
+def _repeated_scattering(kernel: Kernel, strength: Pair, thickness: Array) -> Pair:
     """Flux that a thin slab scatters more than once: what is caught again on its way out scatters and then leaves."""
     gain, depth = _depths(kernel, thickness)
     started = gain * exprel(depth)[..., None, :]
-    up, down = (started * part - once for part, once in zip(strength, _once(kernel, strength, thickness), strict=True))
+    up, down = (
+        started * part - once
+        for part, once in zip(strength, _single_scattering(kernel, strength, thickness), strict=True)
+    )
     again = 2.0 * jnp.pi * kernel.solid[:, None] / kernel.area[..., None, :]
     back, onward = strength[0] * again, strength[1] * again
     risen, turned_down = matmul(kernel.turn(onward), up), matmul(kernel.turn(back), up)  # for what travels upward

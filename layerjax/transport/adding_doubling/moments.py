@@ -21,7 +21,7 @@ import numpy as np
 from jax import Array
 
 from layerjax import fresnel
-from layerjax._numerics import at_least
+from layerjax._numerics import clamp_min
 from layerjax.directions import Vector, half_vector
 from layerjax.phase import PhaseFunction
 from layerjax.phase.moments import moments_by_quadrature
@@ -34,11 +34,11 @@ NARROW = 6
 """Times the moments that a grid carries of it: those that a backward peak has if the grid shows no width of it."""
 
 
-class Terms(NamedTuple):
+class MomentCounts(NamedTuple):
     """L of forward peaks, and of backward ones.
 
     Values between as many nodes follow as many moments. Under an interface there are two panels of nodes. Of a backward
-    peak no grid may carry more: see `truncated`.
+    peak no grid may carry more: see `truncate`.
     """
 
     forward: int
@@ -50,19 +50,19 @@ class Terms(NamedTuple):
         return max(self.forward, self.backward + self.backward // 2)
 
 
-def terms(nodes: int, layered: bool) -> Terms:
+def terms(nodes: int, layered: bool) -> MomentCounts:
     """For a grid of so many nodes a panel; layered: whether the stack has interfaces."""
     least = max(LEAST_TERMS, nodes)
-    return Terms(max(LEAST_TERMS, 2 * nodes) if layered else least, least)
+    return MomentCounts(max(LEAST_TERMS, 2 * nodes) if layered else least, least)
 
 
-def scaled(stack: Stack, nodes: int) -> Stack | None:
+def delta_scale(stack: Stack, nodes: int) -> Stack | None:
     """The stack with the media that the grid carries, their phase functions whole; None if these are its own."""
     carried = terms(nodes, any(isinstance(layer, Interface) for layer in stack.layers))
-    return _scaled(stack, carried) if any(_has_peak(layer, carried) for layer in stack.layers) else None
+    return _delta_scale(stack, carried) if any(_has_peak(layer, carried) for layer in stack.layers) else None
 
 
-def _has_peak(layer: Interface | Medium, carried: Terms) -> bool:
+def _has_peak(layer: Interface | Medium, carried: MomentCounts) -> bool:
     """Whether some of what it scatters may be ballistic, as far as is known while tracing."""
     if not isinstance(layer, Medium) or is_known(layer.albedo, 0.0):
         return False
@@ -71,17 +71,17 @@ def _has_peak(layer: Interface | Medium, carried: Terms) -> bool:
 
 
 @eqx.filter_jit
-def _scaled(stack: Stack, carried: Terms) -> Stack:
-    layers = [_less_forward(layer, carried) if _has_peak(layer, carried) else layer for layer in stack.layers]
+def _delta_scale(stack: Stack, carried: MomentCounts) -> Stack:
+    layers = [_scale_medium(layer, carried) if _has_peak(layer, carried) else layer for layer in stack.layers]
     return eqx.tree_at(lambda s: s.layers, stack, tuple(layers))
 
 
-def _less_forward(medium: Interface | Medium, carried: Terms) -> Medium:
+def _scale_medium(medium: Interface | Medium, carried: MomentCounts) -> Medium:
     assert isinstance(medium, Medium)
     dtype = jnp.result_type(*(leaf for leaf in jax.tree.leaves(medium) if eqx.is_array(leaf)), jnp.float32)
-    _, onward, _ = truncated(medium.phase, False, carried, dtype)
+    _, onward, _ = truncate(medium.phase, False, carried, dtype)
     if medium.f0 is not None:
-        _, fifth, _ = truncated(medium.phase, True, carried, dtype)
+        _, fifth, _ = truncate(medium.phase, True, carried, dtype)
         onward = medium.f0 * onward + (1.0 - medium.f0) * fifth
     left = 1.0 - medium.albedo * onward
     return eqx.tree_at(lambda m: (m.thickness, m.albedo), medium, (medium.thickness * left, medium.albedo / left))
@@ -127,7 +127,7 @@ def _legendre_functions(cosine: Array, sine: Array, modes: int, count: int) -> A
     return jax.lax.scan(step, (zero, zero), factors)[1] * half
 
 
-def truncated(phase: PhaseFunction, is_schlick: bool, carried: Terms, dtype: Any) -> tuple[Array, Array, Array]:
+def truncate(phase: PhaseFunction, is_schlick: bool, carried: MomentCounts, dtype: Any) -> tuple[Array, Array, Array]:
     """Moments that a grid carries, and the shares of a collision that count as ballistic and as retroreflected.
 
     A backward peak is cut off, and smoothly, so that slabs do not gain energy (see `slab`): what it has beyond counts
@@ -147,7 +147,7 @@ def truncated(phase: PhaseFunction, is_schlick: bool, carried: Terms, dtype: Any
         chi = jnp.asarray(found, dtype)
     before, last = chi[carried.forward - 1], chi[carried.forward]
     points_back = before * last < 0.0
-    onward = at_least(jnp.minimum(before, last), 0.0)
+    onward = clamp_min(jnp.minimum(before, last), 0.0)
     back = jnp.where(
         points_back & (not is_schlick), jnp.abs(chi[-1]), 0.0
     )  # that factor is 0 in the backward direction

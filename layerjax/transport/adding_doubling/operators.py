@@ -27,7 +27,7 @@ class Parts(eqx.Module):
 
     @property
     def total(self) -> Operator:
-        return plus(self.first, self.rest)
+        return add_operators(self.first, self.rest)
 
 
 class Layer(eqx.Module):
@@ -59,17 +59,17 @@ class Layer(eqx.Module):
 def add(upper: Layer, lower: Layer) -> Layer:
     """`upper` on top of `lower` (Grant & Hunt 1969); light from below only if `lower` lets any pass."""
     down, up = (upper.direct_down, lower.direct_down), (lower.direct_up, upper.direct_up)
-    falling, extra = _falling(upper.reflect_bottom, lower.reflect_top, upper.transmit_down, down[0])
-    reflect_top = _returned(upper.reflect_top, upper.transmit_up, lower.reflect_top, (down[0], up[1]), falling)
+    falling, extra = _incident_flux(upper.reflect_bottom, lower.reflect_top, upper.transmit_down, down[0])
+    reflect_top = _add_reflection(upper.reflect_top, upper.transmit_up, lower.reflect_top, (down[0], up[1]), falling)
     if lower.transmit_down.total is None and down[1] is None:
         return Layer(reflect_top)
-    transmit_down = _passed(upper.transmit_down, lower.transmit_down, down, falling, extra)
-    rising, extra = _falling(lower.reflect_top, upper.reflect_bottom, lower.transmit_up, up[0])
-    reflect_bottom = _returned(
+    transmit_down = _add_transmission(upper.transmit_down, lower.transmit_down, down, falling, extra)
+    rising, extra = _incident_flux(lower.reflect_top, upper.reflect_bottom, lower.transmit_up, up[0])
+    reflect_bottom = _add_reflection(
         lower.reflect_bottom, lower.transmit_down, upper.reflect_bottom, (up[0], down[1]), rising
     )
-    transmit_up = _passed(lower.transmit_up, upper.transmit_up, up, rising, extra)
-    return Layer(reflect_top, reflect_bottom, transmit_down, transmit_up, times(*down), times(*up))
+    transmit_up = _add_transmission(lower.transmit_up, upper.transmit_up, up, rising, extra)
+    return Layer(reflect_top, reflect_bottom, transmit_down, transmit_up, multiply(*down), multiply(*up))
 
 
 def double(
@@ -85,45 +85,51 @@ def double(
     """
     down, up = direct
     back = Parts(turn(reflect.first), turn(reflect.rest))
-    falling, extra = _falling(back, reflect, transmit, down)
+    falling, extra = _incident_flux(back, reflect, transmit, down)
     rising = Parts(turn(transmit.first), turn(transmit.rest))
-    both = _returned(reflect, rising, reflect, (down, up), falling)
-    return both.rest, _passed(transmit, transmit, (down, down), falling, extra).rest
+    both = _add_reflection(reflect, rising, reflect, (down, up), falling)
+    return both.rest, _add_transmission(transmit, transmit, (down, down), falling, extra).rest
 
 
-def _falling(back: Parts, base: Parts, transmit: Parts, direct: Operator) -> tuple[Operator, Operator]:
+def _incident_flux(back: Parts, base: Parts, transmit: Parts, direct: Operator) -> tuple[Operator, Operator]:
     """Diffuse flux that falls on the far layer, and the part of it that was reflected at least once."""
     loop = matmul(back.total, base.total)
     if loop is None:
         return transmit.total, None
-    turned = plus(matmul(loop, transmit.total), right(loop, direct))
+    turned = add_operators(matmul(loop, transmit.total), scale_columns(loop, direct))
     assert turned is not None
     extra = inverse_of_one_minus(loop) @ turned
-    return plus(transmit.total, extra), extra
+    return add_operators(transmit.total, extra), extra
 
 
-def _returned(near: Parts, out: Parts, base: Parts, direct: tuple[Operator, Operator], falling: Operator) -> Parts:
+def _add_reflection(
+    near: Parts, out: Parts, base: Parts, direct: tuple[Operator, Operator], falling: Operator
+) -> Parts:
     """Reflection: off the near layer, and off the far one and out through the near one (direct: in, out)."""
     into, back = direct
-    first = plus(near.first, left(back, right(base.first, into)))
+    first = add_operators(near.first, scale_rows(back, scale_columns(base.first, into)))
     diffuse = matmul(base.total, falling)
-    rest = plus(
+    rest = add_operators(
         near.rest,
-        left(back, plus(right(base.rest, into), diffuse)),
-        matmul(out.total, plus(right(base.total, into), diffuse)),
+        scale_rows(back, add_operators(scale_columns(base.rest, into), diffuse)),
+        matmul(out.total, add_operators(scale_columns(base.total, into), diffuse)),
     )
     return Parts(first, rest)
 
 
-def _passed(near: Parts, far: Parts, direct: tuple[Operator, Operator], falling: Operator, extra: Operator) -> Parts:
+def _add_transmission(
+    near: Parts, far: Parts, direct: tuple[Operator, Operator], falling: Operator, extra: Operator
+) -> Parts:
     """Transmission through the near layer and then the far one (direct: near, far)."""
     into, out = direct
-    first = plus(left(out, near.first), right(far.first, into))
-    rest = plus(left(out, plus(near.rest, extra)), right(far.rest, into), matmul(far.total, falling))
+    first = add_operators(scale_rows(out, near.first), scale_columns(far.first, into))
+    rest = add_operators(
+        scale_rows(out, add_operators(near.rest, extra)), scale_columns(far.rest, into), matmul(far.total, falling)
+    )
     return Parts(first, rest)
 
 
-def turned(operator: Operator, azimuths: int | None) -> Operator:
+def rotate(operator: Operator, azimuths: int | None) -> Operator:
     """The operator with both its directions turned by half a turn about the normal; modes (None) do not change."""
     if azimuths is None or operator is None:
         return operator
@@ -132,7 +138,7 @@ def turned(operator: Operator, azimuths: int | None) -> Operator:
     return jnp.roll(operator.reshape(shape), (half, half), (-3, -1)).reshape(operator.shape)
 
 
-def plus(*terms: Operator) -> Operator:
+def add_operators(*terms: Operator) -> Operator:
     """Sum of what is there."""
     total: Operator = None
     for term in terms:
@@ -141,19 +147,19 @@ def plus(*terms: Operator) -> Operator:
     return total
 
 
-def times(a: Operator, b: Operator) -> Operator:
+def multiply(a: Operator, b: Operator) -> Operator:
     """Product number by number, None if a factor is not there."""
     return None if a is None or b is None else a * b
 
 
-def left(diagonal: Operator, operator: Operator) -> Operator:
+def scale_rows(diagonal: Operator, operator: Operator) -> Operator:
     """diag(d) F."""
-    return None if diagonal is None else times(diagonal[..., :, None], operator)
+    return None if diagonal is None else multiply(diagonal[..., :, None], operator)
 
 
-def right(operator: Operator, diagonal: Operator) -> Operator:
+def scale_columns(operator: Operator, diagonal: Operator) -> Operator:
     """F diag(d)."""
-    return None if diagonal is None else times(operator, diagonal[..., None, :])
+    return None if diagonal is None else multiply(operator, diagonal[..., None, :])
 
 
 def matmul(a: Operator, b: Operator) -> Operator:

@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 from jax import Array
 
-from layerjax.directions import Vector, flip, sanitised, select
+from layerjax.directions import Vector, flip, sanitise, select
 from layerjax.surfaces.interface import interface_pdf, interface_reflection, interface_sample, interface_transmission
 from layerjax.surfaces.lambertian import sample_cosine
 from layerjax.transport.first_order import FirstOrder, ReflectingInterface
@@ -25,14 +25,14 @@ def propose(state: FirstOrder, wi: Vector, uniforms: tuple[Array, Array, Array])
         face = state.crossing
         ior = _ratio(face, above)
         refracted, leaves = interface_sample(up, ior, face.alpha, u1, u2, again, face.distribution)
-        wo = select(u < lobes + facets, _nowhere_unless(leaves, refracted), wo)
+        wo = select(u < lobes + facets, _tangent_unless(leaves, refracted), wo)
     wo = select(above, wo, flip(wo))
     inner = (jnp.minimum(u / lobes, BELOW_ONE), u1, u2)
     single = SingleScattering()
     lobe = single.sample(state.upper, wi, inner)
     if state.lower is not None:
         lobe = select(above, lobe, flip(single.sample(state.lower, flip(wi), inner)))
-        lobe = _nowhere_unless(lobe[2] * wi[2] > 0, lobe)  # what a face sends below its horizon is masked
+        lobe = _tangent_unless(lobe[2] * wi[2] > 0, lobe)  # what a face sends below its horizon is masked
     return select(u < lobes, lobe, wo)
 
 
@@ -51,9 +51,9 @@ def proposal_density(state: FirstOrder, wi: Vector, wo: Vector) -> Array:
         up, out = select(above, wi, flip(wi)), select(above, wo, flip(wo))
         face = state.crossing
         facets_of = (_ratio(face, above), face.alpha, face.distribution)
-        up, out = sanitised(up, up[2] > 0), (out[0], out[1], jnp.where(out[2] == 0, 0.5, out[2]))
-        reflected = interface_reflection(up, sanitised(out, out[2] > 0), *facets_of)
-        passed = interface_transmission(up, flip(sanitised(flip(out), out[2] < 0)), *facets_of)
+        up, out = sanitise(up, up[2] > 0), (out[0], out[1], jnp.where(out[2] == 0, 0.5, out[2]))
+        reflected = interface_reflection(up, sanitise(out, out[2] > 0), *facets_of)
+        passed = interface_transmission(up, flip(sanitise(flip(out), out[2] < 0)), *facets_of)
         density = density + facets * interface_pdf(jnp.where(same, reflected, passed), up, out, *facets_of)
     return density
 
@@ -65,7 +65,7 @@ def _shares(state: FirstOrder) -> tuple[float, float, float, float]:
     return (0.5, 0.0, 0.25, 0.25) if state.crossing is None else (0.3, 0.4, 0.15, 0.15)
 
 
-def _nowhere_unless(leaves: Array, w: Vector) -> Vector:
+def _tangent_unless(leaves: Array, w: Vector) -> Vector:
     """w, or a direction in the tangent plane, where nothing is scattered to."""
     return (w[0], w[1], jnp.where(leaves, w[2], 0.0))
 

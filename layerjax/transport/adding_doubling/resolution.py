@@ -1,11 +1,11 @@
-"""How finely a stack has to be solved, by what is known of it before tracing: see `chosen`.
+"""How finely a stack has to be solved, by what is known of it before tracing: see `choose_resolution`.
 
 Light that an interface lets in, a medium scatters and a base reflects is smooth in direction where one of them
 scatters widely. What nodes and modes must resolve are narrow lobes behind the first interface, each by itself: nodes go
 with one over the width of the narrowest in elevation, modes in azimuth, which is steeper the more the light inside is
 inclined (a lower index lets it in closer to grazing).
 
-What is traced has no numbers to go by. Under `grad` and `vmap` alone they are still read (`known_values`), so that
+What is traced has no numbers to go by. Under `grad` and `vmap` alone they are still read (`concrete_values`), so that
 these solve what a plain call solves. Under ``jit`` a lobe counts as `ASSUMED_WIDTH` wide: right for what is wider, at
 the cost of what is as narrow. `choose_transport` outside of ``jit`` knows better.
 """
@@ -18,15 +18,15 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from layerjax._known import known_values
+from layerjax._concrete import concrete_values
 from layerjax.compiling import is_traced
 from layerjax.stack import Interface, Medium, Stack, TurbidMedium, is_known
 from layerjax.surfaces import Conductor
 
-LADDER = ((6, 8), (8, 12), (12, 16), (16, 24), (24, 32), (32, 48), (48, 64), (64, 96), (96, 128), (128, 192))
+RESOLUTIONS = ((6, 8), (8, 12), (12, 16), (16, 24), (24, 32), (32, 48), (48, 64), (64, 96), (96, 128), (128, 192))
 """Resolutions (nodes, modes) that are chosen from, and that a tolerance climbs."""
 
-ORDINATES_LADDER = ((6, 8), (8, 12), (10, 16), (12, 20), (14, 24), (16, 28), (20, 36), (24, 44))
+ORDINATES = ((6, 8), (8, 12), (10, 16), (12, 20), (14, 24), (16, 28), (20, 36), (24, 44))
 """Ordinates (cosines, azimuths) that are chosen from, and that a tolerance climbs."""
 
 MOST_NUMBERS, MOST_OF_ORDINATES = 6e6, 1.2e6
@@ -35,7 +35,7 @@ MOST_NUMBERS, MOST_OF_ORDINATES = 6e6, 1.2e6
 SHORT = 1.25
 """A resolution by so much less than the expected one gives a warning."""
 
-FOLLOWED, READ = LADDER[0], LADDER[2]
+LEAST_KNOWN, LEAST_TABULATED = RESOLUTIONS[0], RESOLUTIONS[2]
 """At least: where light is followed along known directions, and where values are read off tables."""
 
 NODES, MODES = 1.7, 4.5
@@ -119,30 +119,33 @@ def modes_for(nodes: int) -> int:
     return max(1, 3 * nodes // 2)
 
 
-def chosen(stack: Stack, followed: bool) -> Resolution:
+def choose_resolution(stack: Stack, directions_known: bool) -> Resolution:
     """The coarsest resolution that is expected to give errors of 1e-3, as far as it fits into memory.
 
     Args:
         stack: a simplified stack; where it is traced, `ASSUMED_WIDTH` and `ASSUMED_INDEX` are taken.
-        followed: whether light is followed along the requested directions, so that nothing is read off tables.
+        directions_known: whether light is followed along the requested directions, so that nothing is read off tables.
     """
-    needed, panels = _needed(stack, followed), _panels(stack)
-    last = len(LADDER) - 1
-    rungs = [next((k for k, rung in enumerate(LADDER) if needed[part] <= rung[part]), last) for part in (0, 1)]
-    while max(rungs) and LADDER[rungs[1]][1] * (LADDER[rungs[0]][0] * panels) ** 2 > MOST_NUMBERS:
-        rungs[rungs[1] > rungs[0]] -= 1
-    place = next((k for k, rung in enumerate(ORDINATES_LADDER) if rung[0] >= needed.cosines), len(ORDINATES_LADDER) - 1)
-    while place and (math.prod(ORDINATES_LADDER[place]) * panels) ** 2 > MOST_OF_ORDINATES:
+    needed, panels = _requirement(stack, directions_known), _panels(stack)
+    last = len(RESOLUTIONS) - 1
+    steps = [next((k for k, step in enumerate(RESOLUTIONS) if needed[part] <= step[part]), last) for part in (0, 1)]
+    while max(steps) and RESOLUTIONS[steps[1]][1] * (RESOLUTIONS[steps[0]][0] * panels) ** 2 > MOST_NUMBERS:
+        steps[steps[1] > steps[0]] -= 1
+    place = next((k for k, step in enumerate(ORDINATES) if step[0] >= needed.cosines), len(ORDINATES) - 1)
+    while place and (math.prod(ORDINATES[place]) * panels) ** 2 > MOST_OF_ORDINATES:
         place -= 1
-    return Resolution(LADDER[rungs[0]][0], LADDER[rungs[1]][1], ORDINATES_LADDER[place])
+    return Resolution(RESOLUTIONS[steps[0]][0], RESOLUTIONS[steps[1]][1], ORDINATES[place])
 
 
-def shortage(stack: Stack, followed: bool) -> str | None:
+def shortage(stack: Stack, directions_known: bool) -> str | None:
     """What is chosen and what would be needed, in words, where that is clearly more; None where it is not.
 
     Of what is traced nothing is said.
     """
-    (nodes, modes, cosines), found = _needed(stack, followed, assumed=1.0), chosen(stack, followed)
+    (nodes, modes, cosines), found = (
+        _requirement(stack, directions_known, assumed=1.0),
+        choose_resolution(stack, directions_known),
+    )
     if any(map(is_tilted, stack.layers)):
         if cosines <= SHORT * found.ordinates[0]:
             return None
@@ -152,18 +155,18 @@ def shortage(stack: Stack, followed: bool) -> str | None:
     return f"{found.nodes} nodes and {found.modes} modes, where about {nodes:.0f} and {modes:.0f} are needed"
 
 
-def is_guessed(stack: Stack, followed: bool) -> bool:
+def is_guessed(stack: Stack, directions_known: bool) -> bool:
     """Whether a lobe has to be resolved of whose width nothing is known while tracing, as under ``jit``."""
     if not is_traced(stack):
         return False
     media = [layer for layer in stack.layers if not isinstance(layer, Interface) and not is_known(layer.albedo, 0.0)]
     # phase functions assume a g by themselves
-    if any(known_values(leaf) is None for layer in media for leaf in jax.tree.leaves(layer.phase)):
+    if any(concrete_values(leaf) is None for layer in media for leaf in jax.tree.leaves(layer.phase)):
         return True
-    return _needed(stack, followed, assumed=NARROW) != _needed(stack, followed, assumed=1.0)
+    return _requirement(stack, directions_known, assumed=NARROW) != _requirement(stack, directions_known, assumed=1.0)
 
 
-class Needed(NamedTuple):
+class Requirement(NamedTuple):
     """Nodes and modes, or cosines, for an error of 1e-3."""
 
     nodes: float
@@ -171,19 +174,19 @@ class Needed(NamedTuple):
     cosines: float
 
 
-def _needed(stack: Stack, followed: bool, assumed: float = ASSUMED_WIDTH) -> Needed:
+def _requirement(stack: Stack, directions_known: bool, assumed: float = ASSUMED_WIDTH) -> Requirement:
     """assumed: width of lobes of which nothing is known while tracing."""
-    nodes, modes = map(float, FOLLOWED if followed else READ)
+    nodes, modes = map(float, LEAST_KNOWN if directions_known else LEAST_TABULATED)
     cosines = nodes
-    for width, index in (*_lobes(stack, assumed), *_refracted(stack, assumed)):
+    for width, index in (*_lobes(stack, assumed), *_refracted_lobes(stack, assumed)):
         if width >= 1.0:  # broad: smooth at any resolution
             continue
-        nodes = max(nodes, NODES / (width * _inclined(index or NODES_AS_UNDER)))
-        modes = max(modes, MODES / (width * (LEAST_BARE if index is None else _inclined(index) * index)))
+        nodes = max(nodes, NODES / (width * _steepest_cosine(index or NODES_AS_UNDER)))
+        modes = max(modes, MODES / (width * (LEAST_BARE if index is None else _steepest_cosine(index) * index)))
         cosines = max(cosines, (COSINES if index is None else COSINES_UNDER) / width)
-    for least in _of_peaks(stack, assumed):
+    for least in _peak_nodes(stack, assumed):
         nodes, modes = max(nodes, least), max(modes, MODES_OF_PEAKS * least)
-    return Needed(max(nodes, NODES_INSIDE) if _keeps_inside(stack) else nodes, modes, cosines)
+    return Requirement(max(nodes, NODES_INSIDE) if _traps_light(stack) else nodes, modes, cosines)
 
 
 def _panels(stack: Stack) -> int:
@@ -191,7 +194,7 @@ def _panels(stack: Stack) -> int:
     return 1 + sum(isinstance(layer, Interface) for layer in stack.layers)
 
 
-def _inclined(index: float) -> float:
+def _steepest_cosine(index: float) -> float:
     """Cosine of the most inclined light that counts where the index is this one."""
     return max(LEAST_COSINE, math.sqrt(max(0.0, 1.0 - 1.0 / index**2)))
 
@@ -211,19 +214,19 @@ def _lobes(stack: Stack, assumed: float) -> Iterator[tuple[float, float | None]]
         yield _least(stack.base.alpha, assumed), index
 
 
-def _of_peaks(stack: Stack, assumed: float) -> Iterator[float]:
+def _peak_nodes(stack: Stack, assumed: float) -> Iterator[float]:
     """Nodes that the peaks of media need; those backward of media that stand bare are among `_lobes`."""
     bare = FORWARD if stack.base is None else FORWARD_TO_BASE
     index, blur, within = 1.0, 0.0, False
     for layer in stack.layers:
         if isinstance(layer, Interface):
-            below = known_values(layer.ior)
+            below = concrete_values(layer.ior)
             if below is not None:  # of what is not known nothing is widened
                 bent = abs(1.0 - index / float(np.min(below)))
                 blur, index = math.hypot(blur, BLUR * bent * _least(layer.alpha, assumed)), float(np.min(below))
             within = True
         elif not is_known(layer.albedo, 0.0):
-            onward = _least(layer.phase.onward_width, assumed)
+            onward = _least(layer.phase.ballistic_width, assumed)
             if onward < 1.0:
                 yield FORWARD_WITHIN / math.hypot(onward, blur) if within else bare / onward
             backward = _least(layer.phase.width, assumed)
@@ -231,16 +234,16 @@ def _of_peaks(stack: Stack, assumed: float) -> Iterator[float]:
                 yield BACKWARD_WITHIN / math.hypot(backward, blur)
 
 
-def _keeps_inside(stack: Stack) -> bool:
+def _traps_light(stack: Stack) -> bool:
     """Whether light inside meets an interface to a lower index, as far as is known while tracing."""
-    indices = [known_values(layer.ior) for layer in stack.layers if isinstance(layer, Interface)]
+    indices = [concrete_values(layer.ior) for layer in stack.layers if isinstance(layer, Interface)]
     return any(
         here is not None and there is not None and bool(np.min(there) < np.max(here))
         for here, there in itertools.pairwise(indices)
     )
 
 
-def _refracted(stack: Stack, assumed: float) -> Iterator[tuple[float, float | None]]:
+def _refracted_lobes(stack: Stack, assumed: float) -> Iterator[tuple[float, float | None]]:
     """The same of what passes one interface to the next.
 
     Light through interfaces is as narrow as facets deflect it. Through two of them alone it is known in closed form; on
@@ -250,7 +253,7 @@ def _refracted(stack: Stack, assumed: float) -> Iterator[tuple[float, float | No
     if stack.base is not None or len(faces) < 2 or (len(faces) == 2 and not any(map(is_tilted, stack.layers))):
         return
     indices = [1.0, *(_least(face.ior, ASSUMED_INDEX) for face in faces)]
-    known = [True, *(known_values(face.ior) is not None for face in faces)]
+    known = [True, *(concrete_values(face.ior) is not None for face in faces)]
     for place, face in enumerate(faces):
         for here, there in ((place, place + 1), (place + 1, place)):
             if not 0 < here < len(faces):  # between two of them
@@ -263,17 +266,17 @@ def _refracted(stack: Stack, assumed: float) -> Iterator[tuple[float, float | No
 
 
 def _least(value: Any, assumed: float) -> float:
-    values = known_values(value)
+    values = concrete_values(value)
     return assumed if values is None else max(float(np.min(values)), NARROW)
 
 
-def rungs(stack: Stack) -> Iterator[Resolution]:
+def resolutions(stack: Stack) -> Iterator[Resolution]:
     """All resolutions, from coarse to fine, of the kind that the stack is solved at."""
     tilted = any(map(is_tilted, stack.layers))
-    for rung in ORDINATES_LADDER if tilted else LADDER:
-        yield Resolution(*LADDER[0], rung) if tilted else Resolution(*rung, ORDINATES_LADDER[0])
+    for step in ORDINATES if tilted else RESOLUTIONS:
+        yield Resolution(*RESOLUTIONS[0], step) if tilted else Resolution(*step, ORDINATES[0])
 
 
 def is_tilted(layer: Any) -> bool:
     """Whether the layer is a medium that is not symmetric about the normal (as far as is known while tracing)."""
-    return isinstance(layer, Medium | TurbidMedium) and not layer.phase.is_upright
+    return isinstance(layer, Medium | TurbidMedium) and not layer.phase.is_axisymmetric

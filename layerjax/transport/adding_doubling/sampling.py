@@ -12,8 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from layerjax._batching import by_rows
-from layerjax._numerics import at_least, safe_div
+from layerjax._batching import map_row_chunks
+from layerjax._numerics import clamp_min, safe_div
 from layerjax.directions import Vector
 from layerjax.transport.adding_doubling.grid import Region
 
@@ -23,7 +23,7 @@ LEAST_SAMPLES = 96
 GRADING = 3
 """Power of the place, from 0 to 1, that azimuths go with where they are dense about the plane of incidence."""
 
-AT_ONCE = 1 << 18
+MOST_ENTRIES = 1 << 18
 """Numbers that an array of kernels at azimuths holds at most."""
 
 UNROLLED = 8
@@ -69,9 +69,11 @@ def modes_at_nodes(
         shape = (mu_o.shape[0], mu_i.shape[1], samples)
         return [jnp.broadcast_to(value, shape) @ cosines for value in function(wi, wo)]
 
-    chunks = out.cosine.size * into.cosine.size * samples // AT_ONCE
+    chunks = out.cosine.size * into.cosine.size * samples // MOST_ENTRIES
     rows = out.cosine, out.sine
-    return [jnp.moveaxis(found, -1, 0) for found in (by_rows(of_rows, rows, chunks) if chunks > 1 else of_rows(rows))]
+    return [
+        jnp.moveaxis(found, -1, 0) for found in (map_row_chunks(of_rows, rows, chunks) if chunks > 1 else of_rows(rows))
+    ]
 
 
 def cosines(x: Array, count: int) -> Array:
@@ -105,7 +107,7 @@ def balance(
     exists = (energy > 0) & (weight > 0)
 
     def better(scale: Array, _: None) -> tuple[Array, None]:
-        ratio = safe_div(energy, at_least(scattered(scale), 1e-3 * energy))
+        ratio = safe_div(energy, clamp_min(scattered(scale), 1e-3 * energy))
         return jnp.where(exists, scale * jnp.sqrt(jnp.where(exists, ratio, 1.0)), 1.0), None
 
     scale, _ = jax.lax.scan(better, jnp.ones_like(energy), None, length=BALANCING)
@@ -117,7 +119,7 @@ def ballistic_share(missing: Array, weight: Array) -> Array:
     return jnp.diag(safe_div(missing, weight))
 
 
-def scaled_to_energy(region: Region, kernel: Array, energy: Array) -> Array:
+def scale_to_energy(region: Region, kernel: Array, energy: Array) -> Array:
     """Flux operator of a face from its BRDF at the nodes and its albedo, which decides."""
     weight = projected_weight(region)
     scale, missing = balance([(kernel[0], lambda d: d)], weight, jnp.where(region.weight > 0, energy, 0.0))

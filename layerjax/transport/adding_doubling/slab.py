@@ -19,8 +19,8 @@ import jax.numpy as jnp
 from jax import Array
 from jax.custom_batching import sequential_vmap
 
-from layerjax._batching import room
-from layerjax._numerics import at_least, broadcasting, horner
+from layerjax._batching import chunk_factor
+from layerjax._numerics import allow_broadcasting, clamp_min, horner
 from layerjax.transport.adding_doubling.inverse import inverse
 
 SMALL, TINY = 0.2, 1e-4
@@ -60,13 +60,13 @@ def slab(p: Array, q: Array, half: Array) -> tuple[Array, Array]:
 
 
 @slab.defjvp
-@broadcasting
+@allow_broadcasting
 def _slab_jvp(
     primals: tuple[Array, Array, Array], tangents: tuple[Array, Array, Array]
 ) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
     found = _spectrum(*primals)
     dp, dq, dhalf = tangents
-    in_p = _sandwich(_transposed(found.vectors), dp)
+    in_p = _sandwich(_transpose(found.vectors), dp)
     in_q = _sandwich(found.inverse, dq)
     half, rate = found.half[..., None, None], dhalf[..., None]
     plus, minus, excess = _differences(found.x[..., :, None], found.x[..., None, :])
@@ -80,37 +80,37 @@ def _slab_jvp(
 
 
 def _spectrum(p: Array, q: Array, half: Array) -> _Spectrum:
-    lower, square, basis = _decomposed(p, q)
-    root = jnp.sqrt(at_least(square, 0.0))
+    lower, square, basis = _decompose(p, q)
+    root = jnp.sqrt(clamp_min(square, 0.0))
     x = root * half[..., None]
-    vectors = _transposed(inverse(lower)) @ basis
+    vectors = _transpose(inverse(lower)) @ basis
     one = jnp.eye(p.shape[-1], dtype=p.dtype)
     y = _scaled_square(vectors, root * jnp.tanh(x))
     even = inverse(one + y)
     odd_by_half = inverse(half[..., None, None] * one + _scaled_square(vectors, _x_coth(x)))
-    return _Spectrum(half, root, x, vectors, _transposed(lower @ basis), even, y @ even, odd_by_half)
+    return _Spectrum(half, root, x, vectors, _transpose(lower @ basis), even, y @ even, odd_by_half)
 
 
-def _decomposed(p: Array, q: Array) -> tuple[Array, Array, Array]:
+def _decompose(p: Array, q: Array) -> tuple[Array, Array, Array]:
     """L, lambda^2 and V for every matrix: on a processor one after the other, on a GPU all at once.
 
     Batched LAPACK kernels of jaxlib share the threads that XLA runs on, and two at a time may wait for each other for
     ever (seen with jaxlib 0.10.2 on two cores). On a GPU each took 0.4 ms by itself (H100).
     """
-    if room() > 1:
-        return _decomposed_together(p, q)
+    if chunk_factor() > 1:
+        return _decompose_batch(p, q)
     batch = jnp.broadcast_shapes(p.shape, q.shape)
     flat = [jnp.broadcast_to(part, batch).reshape(-1, *batch[-2:]) for part in (p, q)]
-    found = jax.vmap(_decomposed_alone)(*flat)
+    found = jax.vmap(_decompose_one)(*flat)
     return tuple(part.reshape(*batch[:-2], *part.shape[1:]) for part in found)
 
 
-def _decomposed_together(p: Array, q: Array) -> tuple[Array, Array, Array]:
+def _decompose_batch(p: Array, q: Array) -> tuple[Array, Array, Array]:
     lower = jnp.linalg.cholesky(p)
-    return lower, *jnp.linalg.eigh(_transposed(lower) @ q @ lower)
+    return lower, *jnp.linalg.eigh(_transpose(lower) @ q @ lower)
 
 
-_decomposed_alone = sequential_vmap(_decomposed_together)
+_decompose_one = sequential_vmap(_decompose_batch)
 
 
 def _differences(a: Array, b: Array) -> tuple[Array, Array, Array]:
@@ -175,11 +175,11 @@ def _x_csch(x: Array) -> Array:
 
 
 def _sandwich(outer: Array, inner: Array) -> Array:
-    return outer @ inner @ _transposed(outer)
+    return outer @ inner @ _transpose(outer)
 
 
 def _scaled_square(vectors: Array, scale: Array) -> Array:
-    return (vectors * scale[..., None, :]) @ _transposed(vectors)
+    return (vectors * scale[..., None, :]) @ _transpose(vectors)
 
 
 def _outer(values: Array) -> Array:
@@ -190,5 +190,5 @@ def _diagonal(values: Array) -> Array:
     return values[..., None] * jnp.eye(values.shape[-1], dtype=values.dtype)
 
 
-def _transposed(matrix: Array) -> Array:
+def _transpose(matrix: Array) -> Array:
     return jnp.swapaxes(matrix, -1, -2)

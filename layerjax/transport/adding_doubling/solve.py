@@ -18,19 +18,19 @@ from jax import Array
 from layerjax.normals.facets import Distribution
 from layerjax.stack import Interface, Medium, Stack
 from layerjax.surfaces import Conductor, Lambertian, Surface
-from layerjax.transport.adding_doubling.ballistic import without_ballistic
+from layerjax.transport.adding_doubling.ballistic import subtract_ballistic
 from layerjax.transport.adding_doubling.bases import base_layer
 from layerjax.transport.adding_doubling.elements import Make, Scalars, build_element, element
-from layerjax.transport.adding_doubling.energies import Face, outer_faces
-from layerjax.transport.adding_doubling.facet_light import Normals
+from layerjax.transport.adding_doubling.energies import OuterFace, outer_faces
+from layerjax.transport.adding_doubling.facet_scattering import Normals
 from layerjax.transport.adding_doubling.grid import Grid, Region, make_grid
 from layerjax.transport.adding_doubling.interfaces import NextEvent, interface_layer
 from layerjax.transport.adding_doubling.media import Kernel, kernel_modes, kernel_ordinates, medium_layer
 from layerjax.transport.adding_doubling.moments import terms
 from layerjax.transport.adding_doubling.operators import Layer, add
-from layerjax.transport.adding_doubling.requested import requested_region
+from layerjax.transport.adding_doubling.requested_directions import requested_region
 from layerjax.transport.adding_doubling.resolution import Resolution, is_tilted
-from layerjax.transport.known_directions import Known, KnownDirections
+from layerjax.transport.known_directions import DirectionLookup, KnownDirections
 
 MANY = 3
 """Interfaces of a kind from which on they share a program."""
@@ -61,7 +61,7 @@ def make_plan(stack: Stack, resolution: Resolution, multiple: bool) -> Plan:
 
 def solve(
     stack: Stack, plan: Plan, requested: KnownDirections | None = None
-) -> tuple[Grid, Layer, Layer, tuple[Face | None, Face | None]]:
+) -> tuple[Grid, Layer, Layer, tuple[OuterFace | None, OuterFace | None]]:
     """The grid, the whole stack as one layer, that less what is known in closed form, see `ballistic`, and its outer
     faces, see `outer_faces`.
 
@@ -93,7 +93,7 @@ def make_elements(stack: Stack, plan: Plan, requested: KnownDirections | None, m
 
 def assemble(
     stack: Stack, plan: Plan, elements: list[Any]
-) -> tuple[Grid, Layer, Layer, tuple[Face | None, Face | None]]:
+) -> tuple[Grid, Layer, Layer, tuple[OuterFace | None, OuterFace | None]]:
     """See `solve`; elements: see `make_elements`. Of a base it only matters whether there is one."""
     dtype = _dtype(stack)
     grid = make_grid(_indices(stack, dtype), plan.ranks, plan.nodes, dtype)
@@ -106,10 +106,10 @@ def assemble(
     whole, is_expanded = solved[-1]
     for found, tilted in reversed(solved[:-1]):
         if tilted and not is_expanded:
-            whole, is_expanded = expanded(whole, plan.azimuths), True
-        whole = add(expanded(found, plan.azimuths) if is_expanded and not tilted else found, whole)
+            whole, is_expanded = expand_modes(whole, plan.azimuths), True
+        whole = add(expand_modes(found, plan.azimuths) if is_expanded and not tilted else found, whole)
     layers = [found for found, _ in solved]
-    return grid, whole, without_ballistic(stack, layers, whole), outer_faces(stack, layers)
+    return grid, whole, subtract_ballistic(stack, layers, whole), outer_faces(stack, layers)
 
 
 def can_be_split(stack: Stack) -> bool:
@@ -250,10 +250,10 @@ def _kernel(plan: Plan, region: int, fresnel: bool, tilted: bool, dtype: Any, nu
 def _base(plan: Plan, region: int, dtype: Any, numbers: Any, _: None) -> Layer:
     indices, base = numbers
     here = make_grid(indices, plan.ranks, plan.nodes, dtype).regions[region]
-    return base_layer(here, _relative(base, here.ior), plan.modes, plan.multiple)
+    return base_layer(here, _relative_conductor(base, here.ior), plan.modes, plan.multiple)
 
 
-def followed(stack: Stack, known: Known) -> tuple[Stack, KnownDirections] | None:
+def requested_stack(stack: Stack, known: DirectionLookup) -> tuple[Stack, KnownDirections] | None:
     """The stack with directions that can stand in the place of the grid's outer ones, if there are such.
 
     What ends with a medium is closed where nothing is requested below: light that leaves it there does not come back.
@@ -269,7 +269,7 @@ def followed(stack: Stack, known: Known) -> tuple[Stack, KnownDirections] | None
     return (Stack(stack.layers, black), directions) if directions.all_above else None
 
 
-def expanded(layer: Layer, azimuths: int | None) -> Layer:
+def expand_modes(layer: Layer, azimuths: int | None) -> Layer:
     """Fourier modes to ordinates."""
     assert azimuths is not None
     count = azimuths
@@ -286,7 +286,7 @@ def expanded(layer: Layer, azimuths: int | None) -> Layer:
     return layer.map(operator, lambda direct: jnp.repeat(direct, count, axis=-1))
 
 
-def _relative(base: Surface, above: Array) -> Surface:
+def _relative_conductor(base: Surface, above: Array) -> Surface:
     """A conductor's index counted from what surrounds the stack, as one counted from what lies on it."""
     if not isinstance(base, Conductor):
         return base

@@ -18,10 +18,10 @@ from jax import Array
 from layerjax._numerics import horizon, safe_div
 from layerjax.channels import Channels
 from layerjax.directions import Vector, select
-from layerjax.transport.adding_doubling.energies import Face, node_shares
+from layerjax.transport.adding_doubling.energies import OuterFace, node_shares
 from layerjax.transport.adding_doubling.grid import Grid, Region, stencil, table_matrix
 from layerjax.transport.adding_doubling.interpolate import Axis, look_up
-from layerjax.transport.adding_doubling.operators import Layer, Operator, turned
+from layerjax.transport.adding_doubling.operators import Layer, Operator, rotate
 from layerjax.transport.contract import Side
 
 AZIMUTH_DENSITY = 2
@@ -65,8 +65,8 @@ def make_tables(
     azimuths: int | None,
     opaque: bool,
     interaction_probability: Callable[[Vector], Channels | None],
-    faces: tuple[Face | None, Face | None] | None,
-    onward_probability: Callable[[Vector], Channels | None] | None,
+    faces: tuple[OuterFace | None, OuterFace | None] | None,
+    peak_probability: Callable[[Vector], Channels | None] | None,
 ) -> Tables:
     """Tables of a solved stack.
 
@@ -85,9 +85,9 @@ def make_tables(
     top, bottom = (_End(region, _lift(grid, region, modes, azimuths)) for region in (grid.regions[0], grid.regions[-1]))
     values = _values(rest, top, bottom, azimuths, steps, opaque)
 
-    lit = [(top, Face(whole.reflect_top, whole.transmit_down), 1.0)]
+    lit = [(top, OuterFace(whole.reflect_top, whole.transmit_down), 1.0)]
     if not opaque:
-        lit.append((bottom, Face(whole.reflect_bottom, whole.transmit_up), -1.0))
+        lit.append((bottom, OuterFace(whole.reflect_bottom, whole.transmit_up), -1.0))
     rows = []
     for (end, found, side), face in zip(lit, faces or (None, None), strict=False):
         if faces is not None:
@@ -96,7 +96,7 @@ def make_tables(
         else:
             directions = _node_directions(end.region, azimuths, side)
             share = interaction_probability(directions)
-            onward = None if onward_probability is None else onward_probability(directions)
+            onward = None if peak_probability is None else peak_probability(directions)
             rows.append(
                 [_energy(found.reflect.total, None, share, end), _energy(found.transmit.total, onward, share, end)]
             )
@@ -112,7 +112,7 @@ def _values(
 
     def table(flux: Operator, back: Operator, out: _End, into: _End) -> Array | None:
         flux, back = (_per_weight(operator, end, azimuths) for operator, end in ((flux, out), (back, into)))
-        return _quadrant(flux, turned(back, azimuths), out, into, azimuths, steps)
+        return _quadrant(flux, rotate(back, azimuths), out, into, azimuths, steps)
 
     above = whole.reflect_top.rest
     quadrants = [table(above, above, top, top)]
@@ -182,7 +182,7 @@ def read_rest(tables: Tables, wi: Vector, wo: Vector, side: Side) -> Channels:
         ior_out, ior_into = jnp.where(out[2] < 0, bottom, top), jnp.where(into[2] < 0, bottom, top)
         scale = jnp.where(wo[2] < 0, bottom, top) ** 2
         quadrant = jnp.where(out[2] > 0, 0, jnp.where(into[2] > 0, 2, 1))
-    out, into = _inside(out, valid), _inside(into, valid)
+    out, into = _replace_invalid(out, valid), _replace_invalid(into, valid)
     shape = tables.values[0].shape
     start = quadrant * (shape[0] // (1 if tables.opaque else 3) * math.prod(shape[1:]))
     axes = [
@@ -204,7 +204,7 @@ def read_energies(tables: Tables, wi: Vector) -> list[Channels]:
         valid = valid & above
     row = jnp.where(above | tables.opaque, 0, 1)
     ior = jnp.where(above, tables.grid.regions[0].ior, tables.grid.regions[-1].ior)
-    axes = _points(tables, _inside(wi, valid), ior, np.pi, 1)
+    axes = _points(tables, _replace_invalid(wi, valid), ior, np.pi, 1)
     found = [look_up(tuple(jnp.moveaxis(table, 1, 0)), row * table.shape[-1], axes) for table in tables.energies]
     return [tuple(jnp.where(valid, energy, 0.0) for energy in energies) for energies in found]
 
@@ -217,7 +217,7 @@ def _node_directions(region: Region, azimuths: int | None, side: float) -> Vecto
     return x.ravel(), y.ravel(), jnp.repeat(side * region.cosine, ordinates.size)
 
 
-def _inside(w: Vector, valid: Array) -> Vector:
+def _replace_invalid(w: Vector, valid: Array) -> Vector:
     """w above, or a stand-in where it is not to be read."""
     return (jnp.where(valid, w[0], 0.6), jnp.where(valid, w[1], 0.0), jnp.where(valid, jnp.abs(w[2]), 0.8))
 

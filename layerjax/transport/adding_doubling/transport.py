@@ -21,12 +21,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from layerjax._batching import in_chunks
+from layerjax._batching import map_direction_chunks
 from layerjax._checks import require_choice
 from layerjax._devices import exact_products
-from layerjax._numerics import not_negative, safe_div
+from layerjax._numerics import clamp_nonnegative, safe_div
 from layerjax._shapes import channel_count, map_shape
-from layerjax.channels import Channels, pick, times, total
+from layerjax.channels import Channels, multiply, pick, total
 from layerjax.compiling import filter_jit, is_outermost, is_traced
 from layerjax.directions import Vector, direction, split
 from layerjax.phase.henyey_greenstein import ASSUMED_BACKWARD, ASSUMED_FORWARD
@@ -40,19 +40,19 @@ from layerjax.transport.adding_doubling.elements import (
     record,
     replay,
 )
-from layerjax.transport.adding_doubling.energies import directional_albedo, none_negative
-from layerjax.transport.adding_doubling.moments import scaled
+from layerjax.transport.adding_doubling.energies import clip_negative, directional_albedo
+from layerjax.transport.adding_doubling.moments import delta_scale
 from layerjax.transport.adding_doubling.proposals import proposal_density, propose
-from layerjax.transport.adding_doubling.requested import RequestedValues, read_requested, requested_values
+from layerjax.transport.adding_doubling.requested_directions import RequestedValues, read_requested, requested_values
 from layerjax.transport.adding_doubling.resolution import (
     ASSUMED_WIDTH,
-    ORDINATES_LADDER,
+    ORDINATES,
     Resolution,
-    chosen,
+    choose_resolution,
     is_guessed,
     is_tilted,
     modes_for,
-    rungs,
+    resolutions,
     shortage,
 )
 from layerjax.transport.adding_doubling.solve import (
@@ -60,10 +60,10 @@ from layerjax.transport.adding_doubling.solve import (
     Plan,
     assemble,
     can_be_split,
-    followed,
     make_elements,
     make_plan,
     ranks,
+    requested_stack,
     without_base,
 )
 from layerjax.transport.adding_doubling.tables import Tables, make_tables, read_energies, read_rest
@@ -73,20 +73,20 @@ from layerjax.transport.first_order import (
     evaluate_first,
     first_order,
     interaction_probability,
-    onward_probability,
+    peak_probability,
 )
-from layerjax.transport.known_directions import Known, KnownDirections, known_directions
+from layerjax.transport.known_directions import DirectionLookup, KnownDirections, known_directions
 from layerjax.transport.single_scattering import SingleScattering
 
 Orders = Literal["all", "first", "multiple"]
 
-MOST = 1024
+LARGEST_RESOLUTION = 1024
 """Largest number of nodes, modes, cosines or azimuths; tables of more fit in no memory."""
 
 FACETS_ERROR = 6e-5
 """Relative, of sums over the facets of interfaces at any resolution: up to three times that was seen."""
 
-PROBED = 8
+PROBE_COSINES = 8
 """Known cosines along which a tolerance is checked, at most."""
 
 
@@ -95,10 +95,10 @@ class ResolutionWarning(UserWarning):
     of the lobes are not known."""
 
 
-class Solved(eqx.Module):
+class AddingDoublingState(eqx.Module):
     """A solved stack: what is evaluated in closed form, and the rest: tables, or values between known directions.
 
-    Both are None if there is no rest. ballistic: what passes two interfaces, in neither. scaled: what the rest
+    Both are None if there is no rest. ballistic: what passes two interfaces, in neither. scaled_first: what the rest
     lacks in the place of `first`, in media as the grid has them (see `moments`); None: `first` itself.
     """
 
@@ -106,7 +106,7 @@ class Solved(eqx.Module):
     tables: Tables | None
     requested: RequestedValues | None = None
     ballistic: Ballistic | None = None
-    scaled: FirstOrder | None = None
+    scaled_first: FirstOrder | None = None
 
 
 class AddingDoubling(DeterministicTransport):
@@ -153,7 +153,7 @@ class AddingDoubling(DeterministicTransport):
         ValueError: an option is out of its range, or `tolerance` cannot be reached, or is given for a traced stack.
     """
 
-    uses_known: ClassVar[bool] = True
+    uses_known_directions: ClassVar[bool] = True
 
     nodes: int | None = eqx.field(static=True, default=None)
     modes: int | None = eqx.field(static=True, default=None)
@@ -164,15 +164,17 @@ class AddingDoubling(DeterministicTransport):
 
     def __check_init__(self) -> None:
         for name, value, least in (("nodes", self.nodes, 2), ("modes", self.modes, 1)):
-            if value is not None and not (isinstance(value, int) and least <= value <= MOST):
-                raise ValueError(f"AddingDoubling.{name}: {value!r:.60} is not a whole number from {least} to {MOST}")
+            if value is not None and not (isinstance(value, int) and least <= value <= LARGEST_RESOLUTION):
+                raise ValueError(
+                    f"AddingDoubling.{name}: {value!r:.60} is not a whole number from {least} to {LARGEST_RESOLUTION}"
+                )
         given = (2, 4) if self.ordinates is None else self.ordinates
         pair = isinstance(given, tuple | list) and len(given) == 2 and all(isinstance(one, int) for one in given)
         cosines, azimuths = given if pair else (0, 0)
-        if not (2 <= cosines <= MOST and 4 <= azimuths <= MOST and azimuths % 2 == 0):
+        if not (2 <= cosines <= LARGEST_RESOLUTION and 4 <= azimuths <= LARGEST_RESOLUTION and azimuths % 2 == 0):
             raise ValueError(
-                f"AddingDoubling.ordinates: {self.ordinates!r:.60} is not (cosines from 2 to {MOST}, an even number of "
-                f"azimuths from 4 to {MOST})"
+                f"AddingDoubling.ordinates: {self.ordinates!r:.60} is not (cosines from 2 to {LARGEST_RESOLUTION}, an "
+                f"even number of azimuths from 4 to {LARGEST_RESOLUTION})"
             )
         if self.tolerance is not None and not (
             isinstance(self.tolerance, float | np.floating) and 0.0 < self.tolerance < 1.0
@@ -185,8 +187,8 @@ class AddingDoubling(DeterministicTransport):
         if self.facet_multiple_scattering:
             refuse_vmf(stack, names, "AddingDoubling(facet_multiple_scattering=True)")
 
-    def chosen_for(self, stack: Stack, known: Known) -> "AddingDoubling":
-        found = followed(stack, known) if self.orders != "first" else None
+    def resolve_options(self, stack: Stack, known: DirectionLookup) -> "AddingDoubling":
+        found = requested_stack(stack, known) if self.orders != "first" else None
         stack, directions = (stack, None) if found is None else found
         if self.tolerance is not None:
             if map_shape(stack):
@@ -194,8 +196,8 @@ class AddingDoubling(DeterministicTransport):
                     f"AddingDoubling.tolerance: {self.tolerance:g} is for one stack, not for a map of them: "
                     "give nodes and modes"
                 )
-            return self._climbed(stack, directions)
-        if self._leaves_open(stack):
+            return self._refine(stack, directions)
+        if self._chooses_resolution(stack):
             short = shortage(stack, directions is not None)
             if short is not None:
                 _warn(
@@ -208,82 +210,88 @@ class AddingDoubling(DeterministicTransport):
                     f"{ASSUMED_FORWARD} or below {-ASSUMED_BACKWARD}; transport=lj.choose_transport(stack, wi, wo), "
                     "called outside of jit, goes by the numbers"
                 )
-        return self._at(self._resolution(stack, directions is not None))
+        return self._with_resolution(self._resolution(stack, directions is not None))
 
-    def chosen_for_energies(self, stack: Stack) -> "AddingDoubling":
+    def resolve_options_for_albedo(self, stack: Stack) -> "AddingDoubling":
         """Lobes too narrow for the nodes are no shortage: each node sends their light to itself, as mirrors do."""
         if self.tolerance is not None or any(map(is_tilted, stack.layers)) or shortage(stack, False) is None:
-            return self.chosen_for(stack, lambda: None)
-        return self._at(self._resolution(stack, False))
+            return self.resolve_options(stack, lambda: None)
+        return self._with_resolution(self._resolution(stack, False))
 
-    def prepare(self, stack: Stack) -> Solved:
+    def prepare(self, stack: Stack) -> AddingDoublingState:
         first = first_order(stack)
         if not self._is_solved(stack):
-            return Solved(first, None)
+            return AddingDoublingState(first, None)
         plan = self._plan(stack, None)
-        carried, once = _as_carried(stack, plan)
-        return Solved(first, self._solve(stack, first, once, plan), None, ballistic_paths(carried), once)
+        carried, once = _scale_stack(stack, plan)
+        return AddingDoublingState(first, self._solve(stack, first, once, plan), None, ballistic_paths(carried), once)
 
-    def for_tracing(self, stack: Stack, known: Known) -> "AddingDoubling":
-        found = followed(stack, known) if self.orders != "first" else None
+    def traceable_equivalent(self, stack: Stack, known: DirectionLookup) -> "AddingDoubling":
+        found = requested_stack(stack, known) if self.orders != "first" else None
         whole, directions = (stack, None) if found is None else found
         elements: list[Any] = []
         if self._is_solved(stack) and can_be_split(stack):
             make_elements(whole, self._plan(whole, directions), directions, record(linearize_element, elements))
         options = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
-        return _Planned(**options, ranks=ranks(stack), elements=elements if elements and None not in elements else None)
+        return _TraceableAddingDoubling(
+            **options, ranks=ranks(stack), elements=elements if elements and None not in elements else None
+        )
 
-    def prepare_energies(self, stack: Stack) -> Solved:
+    def prepare_for_albedo(self, stack: Stack) -> AddingDoublingState:
         """Energies are means over azimuth: of Fourier modes the first is all they need."""
         return dataclasses.replace(self, modes=1).prepare(stack)
 
-    def prepare_for(self, stack: Stack, known: Known) -> Solved:
-        found = followed(stack, known) if self.orders != "first" else None
+    def prepare_for_directions(self, stack: Stack, known: DirectionLookup) -> AddingDoublingState:
+        found = requested_stack(stack, known) if self.orders != "first" else None
         if found is None:
             return self.prepare(stack)
         closed, directions = found
         plan = self._plan(closed, directions)
-        rest = self._solve_between(closed, directions, plan)
-        carried, once = _as_carried(closed, plan)
-        return Solved(first_order(closed), None, rest, ballistic_paths(carried), once)
+        rest = self._solve_requested(closed, directions, plan)
+        carried, once = _scale_stack(closed, plan)
+        return AddingDoublingState(first_order(closed), None, rest, ballistic_paths(carried), once)
 
-    def measured(
-        self, state: Solved, wi: Array, wo: Array, side: Side, channels: int, key: Array | None
+    def evaluate_batch(
+        self, state: AddingDoublingState, wi: Array, wo: Array, side: Side, channels: int, key: Array | None
     ) -> tuple[Array, None]:
         if state.requested is None:
-            return super().measured(state, wi, wo, side, channels, key)
+            return super().evaluate_batch(state, wi, wo, side, channels, key)
         i, o = split(wi), split(wo)
         values = self.evaluate(state, i, o, side)
         return jnp.stack([pick(values, c) for c in range(channels)], axis=-1), None
 
-    def doubt(self, state: Solved, wi: Array, wo: Array, side: Side, channels: int) -> Array | float:
+    def common_error(
+        self, state: AddingDoublingState, wi: Array, wo: Array, side: Side, channels: int
+    ) -> Array | float:
         least = FACETS_ERROR if state.first.layered else 0.0
 
         def doubts(wi: Vector, wo: Vector) -> Channels:
             rest = self._rest(state, wi, wo, side)
-            lowest = rest if state.scaled is None else self._sum(state, rest, wi, wo, side)
-            return tuple(least * jnp.abs(pick(rest, c)) + not_negative(-pick(lowest, c)) for c in range(channels))
+            lowest = rest if state.scaled_first is None else self._sum(state, rest, wi, wo, side)
+            return tuple(least * jnp.abs(pick(rest, c)) + clamp_nonnegative(-pick(lowest, c)) for c in range(channels))
 
-        return in_chunks(doubts, wi, wo)
+        return map_direction_chunks(doubts, wi, wo)
 
     def coarser(self) -> "AddingDoubling":
         """This transport at about two thirds of the resolution, for an estimate of the error."""
-        return self._at(self._as_resolution().coarser())
+        return self._with_resolution(self._as_resolution().coarser())
 
     def finer(self) -> "AddingDoubling":
         """This transport at about four thirds of the resolution."""
-        return self._at(self._as_resolution().finer())
+        return self._with_resolution(self._as_resolution().finer())
 
-    def compared(self) -> tuple["AddingDoubling", ...]:
-        return tuple(one for one in (self.coarser(), self.finer()) if one != self._at(self._as_resolution()))
+    def comparison_transports(self) -> tuple["AddingDoubling", ...]:
+        return tuple(
+            one for one in (self.coarser(), self.finer()) if one != self._with_resolution(self._as_resolution())
+        )
 
-    def evaluate(self, state: Solved, wi: Vector, wo: Vector, side: Side) -> Channels:
+    def evaluate(self, state: AddingDoublingState, wi: Vector, wo: Vector, side: Side) -> Channels:
         rest = self._rest(state, wi, wo, side)
-        if state.scaled is None:
-            return self._sum(state, tuple(map(not_negative, rest)), wi, wo, side)
-        return tuple(map(not_negative, self._sum(state, rest, wi, wo, side)))
+        if state.scaled_first is None:
+            return self._sum(state, tuple(map(clamp_nonnegative, rest)), wi, wo, side)
+        return tuple(map(clamp_nonnegative, self._sum(state, rest, wi, wo, side)))
 
-    def _rest(self, state: Solved, wi: Vector, wo: Vector, side: Side) -> Channels:
+    def _rest(self, state: AddingDoublingState, wi: Vector, wo: Vector, side: Side) -> Channels:
         """What is read off: ringing may take it below 0, and where media are scaled what it lacks may, too."""
         if state.requested is not None:
             return read_requested(state.requested, wi, wo, side)
@@ -291,23 +299,23 @@ class AddingDoubling(DeterministicTransport):
             return read_rest(state.tables, wi, wo, side)
         return (jnp.zeros_like(wi[2] * wo[2]),)
 
-    def _sum(self, state: Solved, rest: Channels, wi: Vector, wo: Vector, side: Side) -> Channels:
+    def _sum(self, state: AddingDoublingState, rest: Channels, wi: Vector, wo: Vector, side: Side) -> Channels:
         """The requested orders, of the rest and what is known in closed form."""
         parts = [rest, *_ballistic(state, wi, wo, side)]
         if self.orders == "multiple":
-            if state.scaled is None:
+            if state.scaled_first is None:
                 return total(parts)
             parts.append(tuple(-value for value in evaluate_first(state.first, wi, wo, side)))
-        parts.append(evaluate_first(state.first if state.scaled is None else state.scaled, wi, wo, side))
+        parts.append(evaluate_first(state.first if state.scaled_first is None else state.scaled_first, wi, wo, side))
         return total(parts)
 
-    def sample(self, state: Solved, wi: Vector, uniforms: tuple[Array, Array, Array]) -> Vector:
+    def sample(self, state: AddingDoublingState, wi: Vector, uniforms: tuple[Array, Array, Array]) -> Vector:
         return propose(state.first, wi, uniforms)
 
-    def pdf(self, state: Solved, wi: Vector, wo: Vector) -> Array:
+    def pdf(self, state: AddingDoublingState, wi: Vector, wo: Vector) -> Array:
         return proposal_density(state.first, wi, wo)
 
-    def albedo(self, state: Solved, wi: Vector, nodes: int) -> tuple[Channels, Channels]:
+    def albedo(self, state: AddingDoublingState, wi: Vector, nodes: int) -> tuple[Channels, Channels]:
         """What the first face does by quadrature with `nodes` points, and of the rest what the nodes scatter: lossless
         stacks lose nothing. Of media alone all is from the nodes, as a share of what meets an event at all.
 
@@ -317,11 +325,11 @@ class AddingDoubling(DeterministicTransport):
             energies = read_energies(state.tables, wi)
             if state.first.layered:
                 return directional_albedo(
-                    state.scaled or state.first, energies, wi, nodes, self.facet_multiple_scattering
+                    state.scaled_first or state.first, energies, wi, nodes, self.facet_multiple_scattering
                 )
             met = interaction_probability(state.first, wi)
-            near, far = none_negative(*energies)
-            return (near, far) if met is None else (times(near, met), times(far, met))
+            near, far = clip_negative(*energies)
+            return (near, far) if met is None else (multiply(near, met), multiply(far, met))
         if state.first.layered:
             raise ValueError(
                 f'AddingDoubling.orders: {self.orders!r} gives no albedo where there are interfaces, "all" does'
@@ -347,30 +355,30 @@ class AddingDoubling(DeterministicTransport):
         elements = make_elements(stack, plan, None, compile_element)
         return _tables_of_elements(without_base(stack), elements, first, once, plan)
 
-    def _solve_between(self, stack: Stack, known: KnownDirections, plan: Plan) -> RequestedValues:
+    def _solve_requested(self, stack: Stack, known: KnownDirections, plan: Plan) -> RequestedValues:
         if not _is_split(stack, known):
-            return _solve_between_at_once(stack, known, plan)
+            return _solve_requested_at_once(stack, known, plan)
         elements = make_elements(stack, plan, known, compile_element)
-        return _between_of_elements(without_base(stack), elements, known, plan)
+        return _requested_values_of_elements(without_base(stack), elements, known, plan)
 
-    def _at(self, resolution: Resolution) -> "AddingDoubling":
+    def _with_resolution(self, resolution: Resolution) -> "AddingDoubling":
         return dataclasses.replace(self, **resolution._asdict(), tolerance=None)
 
     def _as_resolution(self) -> Resolution:
         if self.nodes is None:
             raise ValueError("AddingDoubling.nodes: none are given; choose_transport finds them for a stack")
-        return Resolution(self.nodes, self.modes or modes_for(self.nodes), self.ordinates or ORDINATES_LADDER[0])
+        return Resolution(self.nodes, self.modes or modes_for(self.nodes), self.ordinates or ORDINATES[0])
 
-    def _resolution(self, stack: Stack, followed: bool) -> Resolution:
+    def _resolution(self, stack: Stack, directions_known: bool) -> Resolution:
         """What is given, and for the rest what is chosen."""
         if self.nodes and self.modes and self.ordinates:
             return Resolution(self.nodes, self.modes, self.ordinates)
-        by_stack = chosen(stack, followed)
+        by_stack = choose_resolution(stack, directions_known)
         nodes = by_stack.nodes if self.nodes is None else self.nodes
         modes = by_stack.modes if self.nodes is None else modes_for(self.nodes)
         return Resolution(nodes, self.modes or modes, self.ordinates or by_stack.ordinates)
 
-    def _leaves_open(self, stack: Stack) -> bool:
+    def _chooses_resolution(self, stack: Stack) -> bool:
         if any(map(is_tilted, stack.layers)):
             return self.ordinates is None
         return self.nodes is None
@@ -378,7 +386,7 @@ class AddingDoubling(DeterministicTransport):
     def _plan(self, stack: Stack, known: KnownDirections | None) -> Plan:
         return make_plan(stack, self._resolution(stack, known is not None), self.facet_multiple_scattering)
 
-    def _climbed(self, stack: Stack, known: KnownDirections | None) -> "AddingDoubling":
+    def _refine(self, stack: Stack, known: KnownDirections | None) -> "AddingDoubling":
         """The coarsest resolution that agrees with the one before to `tolerance`, at the requested directions if
         light is followed along them, else all over the hemispheres."""
         if is_traced(stack):
@@ -388,17 +396,19 @@ class AddingDoubling(DeterministicTransport):
             )
         # within a program that is traced its own are to be run; outside, their constants need none of their own
         with nullcontext() if is_outermost(stack) else jax.ensure_compile_time_eval():
-            return self._agreeing(stack, None if is_traced(known) else known)
+            return self._refine_until_agreement(stack, None if is_traced(known) else known)
 
-    def _agreeing(self, stack: Stack, known: KnownDirections | None) -> "AddingDoubling":
+    def _refine_until_agreement(self, stack: Stack, known: KnownDirections | None) -> "AddingDoubling":
         assert self.tolerance is not None
         wi, wo = _probes(stack.base is not None, known)
         before: Array | None = None
         change = np.inf
-        for rung in rungs(stack):
-            options = self._at(rung)
-            state = options.prepare_for(stack, partial(known_directions, wi, wo) if known is not None else lambda: None)
-            values, found, rest = _at_probes(options, state, wi, wo, channel_count(stack))
+        for resolution in resolutions(stack):
+            options = self._with_resolution(resolution)
+            state = options.prepare_for_directions(
+                stack, partial(known_directions, wi, wo) if known is not None else lambda: None
+            )
+            values, found, rest = _probe_values(options, state, wi, wo, channel_count(stack))
             if before is not None:
                 change = float(jnp.max(safe_div(jnp.abs(found - before), values + 0.1 * jnp.mean(rest))))
                 if change <= self.tolerance:
@@ -410,7 +420,7 @@ class AddingDoubling(DeterministicTransport):
         )
 
 
-class _Planned(AddingDoubling):
+class _TraceableAddingDoubling(AddingDoubling):
     """Where the order of indices is known, though they are traced (None: it is not), and all elements, with their
     derivatives (None: they are not)."""
 
@@ -425,38 +435,38 @@ class _Planned(AddingDoubling):
             return super()._solve(stack, first, once, plan)
         return _tables(stack, make_elements(stack, plan, None, replay(self.elements)), first, once, plan)
 
-    def _solve_between(self, stack: Stack, known: KnownDirections, plan: Plan) -> RequestedValues:
+    def _solve_requested(self, stack: Stack, known: KnownDirections, plan: Plan) -> RequestedValues:
         if self.elements is None:
-            return super()._solve_between(stack, known, plan)
-        return _values_between(stack, make_elements(stack, plan, known, replay(self.elements)), known, plan)
+            return super()._solve_requested(stack, known, plan)
+        return _requested_values(stack, make_elements(stack, plan, known, replay(self.elements)), known, plan)
 
 
 @filter_jit
 @exact_products
-def _at_probes(
-    options: AddingDoubling, state: Solved, wi: Array, wo: Array, channels: int
+def _probe_values(
+    options: AddingDoubling, state: AddingDoublingState, wi: Array, wo: Array, channels: int
 ) -> tuple[Array, Array, Array]:
     """Values; what of them is solved; and that without what media that were scaled lack.
 
     What is known in closed form does not change, and where it is a narrow peak it must not set the scale.
     """
     solved, without = dataclasses.replace(options, orders="multiple"), dataclasses.replace(state, ballistic=None)
-    of = (options, state), (solved, without), (solved, dataclasses.replace(without, scaled=None))
-    values, found, rest = (how.measured(what, wi, wo, "all", channels, None)[0] for how, what in of)
+    of = (options, state), (solved, without), (solved, dataclasses.replace(without, scaled_first=None))
+    values, found, rest = (how.evaluate_batch(what, wi, wo, "all", channels, None)[0] for how, what in of)
     return values, found, rest
 
 
-def _ballistic(state: Solved, wi: Vector, wo: Vector, side: Side) -> list[Channels]:
+def _ballistic(state: AddingDoublingState, wi: Vector, wo: Vector, side: Side) -> list[Channels]:
     if state.ballistic is None or side == "reflection":
         return []
     return [evaluate_ballistic(state.ballistic, wi, wo)]
 
 
 def _warn(message: str) -> None:
-    warnings.warn(message, ResolutionWarning, stacklevel=_frames_inside())
+    warnings.warn(message, ResolutionWarning, stacklevel=_caller_depth())
 
 
-def _frames_inside() -> int:
+def _caller_depth() -> int:
     """How far up the call lies that a user wrote."""
     frame, count = sys._getframe(1), 1
     while frame.f_back is not None and frame.f_globals.get("__name__", "").split(".")[0] in ("layerjax", "equinox"):
@@ -464,9 +474,9 @@ def _frames_inside() -> int:
     return count
 
 
-def _as_carried(stack: Stack, plan: Plan) -> tuple[Stack, FirstOrder | None]:
+def _scale_stack(stack: Stack, plan: Plan) -> tuple[Stack, FirstOrder | None]:
     """The stack as the grid has it, and paths with one event in that, where they differ from the stack's own."""
-    carried = scaled(stack, plan.nodes)
+    carried = delta_scale(stack, plan.nodes)
     if carried is None:
         return stack, None
     once = first_order(carried)
@@ -487,8 +497,8 @@ def _solve_at_once(stack: Stack, first: FirstOrder, once: FirstOrder | None, pla
 
 @filter_jit
 @exact_products
-def _solve_between_at_once(stack: Stack, known: KnownDirections, plan: Plan) -> RequestedValues:
-    return _values_between(stack, make_elements(stack, plan, known), known, plan)
+def _solve_requested_at_once(stack: Stack, known: KnownDirections, plan: Plan) -> RequestedValues:
+    return _requested_values(stack, make_elements(stack, plan, known), known, plan)
 
 
 @filter_jit
@@ -501,19 +511,21 @@ def _tables_of_elements(
 
 @filter_jit
 @exact_products
-def _between_of_elements(layers: Layers, elements: list[Any], known: KnownDirections, plan: Plan) -> RequestedValues:
-    return _values_between(layers.stack(), elements, known, plan)
+def _requested_values_of_elements(
+    layers: Layers, elements: list[Any], known: KnownDirections, plan: Plan
+) -> RequestedValues:
+    return _requested_values(layers.stack(), elements, known, plan)
 
 
 def _tables(stack: Stack, elements: list[Any], first: FirstOrder, once: FirstOrder | None, plan: Plan) -> Tables:
     grid, whole, rest, faces = assemble(stack, plan, elements)
     met = partial(interaction_probability, first)
-    onward = None if once is None else partial(onward_probability, first, once)
+    onward = None if once is None else partial(peak_probability, first, once)
     outer = faces if first.layered else None
     return make_tables(grid, whole, rest, plan.azimuths, stack.base is not None, met, outer, onward)
 
 
-def _values_between(stack: Stack, elements: list[Any], known: KnownDirections, plan: Plan) -> RequestedValues:
+def _requested_values(stack: Stack, elements: list[Any], known: KnownDirections, plan: Plan) -> RequestedValues:
     grid, _, rest, _ = assemble(stack, plan, elements)
     return requested_values(rest, known, grid.regions[-1].ior, stack.base is not None)
 
@@ -525,7 +537,7 @@ def _probes(opaque: bool, known: KnownDirections | None) -> tuple[Array, Array]:
     if known is None:
         above = below = jnp.deg2rad(jnp.asarray([3.0, 25.0, 50.0, 70.0, 80.0]))
     else:
-        above, below = (jnp.arccos(side[:: -(-side.size // PROBED)]) for side in (known.above, known.below))
+        above, below = (jnp.arccos(side[:: -(-side.size // PROBE_COSINES)]) for side in (known.above, known.below))
     polar = above if opaque else jnp.concatenate([above, jnp.pi - below])
     theta_i, theta_o, phi = (array.ravel() for array in jnp.meshgrid(polar, polar, azimuth, indexing="ij"))
     return direction(theta_i, jnp.zeros_like(theta_i)), direction(theta_o, phi)

@@ -2,7 +2,7 @@
 
 What a beam becomes that is refracted, reflected and refracted again at rough surfaces is one microfacet lobe of wider
 normals, which follow from the roughnesses in closed form: see `layerjax.transport.endf.warping` for one event,
-`chains` for the coat, `slab` for light that passes, and `drawing` for the sampler.
+`chains` for the coat, `slab` for light that passes, and `sampling` for the sampler.
 """
 
 from collections.abc import Sequence
@@ -16,12 +16,12 @@ from jax import Array
 
 from layerjax import channels
 from layerjax.channels import Channels, per_channel, total
-from layerjax.directions import Vector, flip, is_above, sanitised, select
+from layerjax.directions import Vector, flip, is_above, sanitise, select
 from layerjax.normals.vmf import Masking, concentration
 from layerjax.stack import Interface, Medium, Stack, is_known, media_of
 from layerjax.surfaces import Conductor
 from layerjax.transport.contract import TEXELS, DeterministicTransport, Side
-from layerjax.transport.endf import drawing
+from layerjax.transport.endf import sampling
 from layerjax.transport.endf.chains import Coat, Form, LowerSide, Options, UpperSide, reflections
 from layerjax.transport.endf.slab import transmissions
 
@@ -70,7 +70,7 @@ class ENDF(DeterministicTransport):
         ValueError: an option has an unknown value.
     """
 
-    side_by_side: ClassVar[int] = TEXELS
+    texel_batch: ClassVar[int] = TEXELS
 
     bounces: int = eqx.field(static=True, default=1)
     form: Form = eqx.field(static=True, default="reciprocal")
@@ -136,10 +136,10 @@ class ENDF(DeterministicTransport):
     def evaluate(self, state: Sides, wi: Vector, wo: Vector, side: Side) -> Channels:
         coat = state.upper
         if side != "reflection":
-            coat, wi, wo = _facing(state, wi, wo)
+            coat, wi, wo = _orient(state, wi, wo)
         lit, up, down = is_above(wi), is_above(wo), is_above(flip(wo))
         # both kinds of lobe share what depends on how steep wo is, not on its side
-        wi, over = sanitised(wi), sanitised(wo if side == "reflection" else select(down, flip(wo), wo))
+        wi, over = sanitise(wi), sanitise(wo if side == "reflection" else select(down, flip(wo), wo))
         parts: list[Channels] = [(jnp.zeros_like(wi[2] * wo[2]),)]
         if side != "transmission":
             lobes = reflections(coat, self._options(), wi, over)
@@ -150,24 +150,24 @@ class ENDF(DeterministicTransport):
         return total(parts)
 
     def sample(self, state: Sides, wi: Vector, uniforms: tuple[Array, Array, Array]) -> Vector:
-        coat, up, _ = _facing(state, wi, wi)
-        wo = drawing.draw(coat, self._options(), up, uniforms, state.lower is None)
+        coat, up, _ = _orient(state, wi, wi)
+        wo = sampling.draw(coat, self._options(), up, uniforms, state.lower is None)
         return wo if state.lower is None else select(wi[2] > 0, wo, flip(wo))
 
     def pdf(self, state: Sides, wi: Vector, wo: Vector) -> Array:
-        coat, wi, wo = _facing(state, wi, wo)
-        return drawing.density(coat, self._options(), wi, wo, state.lower is None)
+        coat, wi, wo = _orient(state, wi, wo)
+        return sampling.density(coat, self._options(), wi, wo, state.lower is None)
 
     def albedo(self, state: Sides, wi: Vector, nodes: int) -> tuple[Channels, Channels]:
         """By quadrature, every lobe with a rule of its own: 32 nodes give 1e-4, 2e-3 near the critical angle."""
-        coat, wi, _ = _facing(state, wi, wi)
-        return drawing.energies(coat, self._options(), wi, nodes, state.lower is None)
+        coat, wi, _ = _orient(state, wi, wi)
+        return sampling.energies(coat, self._options(), wi, nodes, state.lower is None)
 
     def _options(self) -> Options:
         return Options(self.bounces, self.form, self.masking)
 
 
-def _facing(state: Sides, wi: Vector, wo: Vector) -> tuple[Coat, Vector, Vector]:
+def _orient(state: Sides, wi: Vector, wo: Vector) -> tuple[Coat, Vector, Vector]:
     """The coat as wi meets it, and both directions turned with it so that wi comes from above."""
     if state.lower is None:
         return state.upper, wi, wo

@@ -16,9 +16,9 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jax import Array
 
-from layerjax._numerics import at_least, safe_sqrt
+from layerjax._numerics import clamp_min, safe_sqrt
 from layerjax.directions import squared_cosine_of_refraction
-from layerjax.normals.vmf import concentration_of, convolved, resultant
+from layerjax.normals.vmf import concentration_of, convolve, resultant
 
 LEAST_VARIANCE = 1e-12
 """Floor of 1 / kappa, for facets of a matched index, which spread nothing: lobes stay wider than a millionth."""
@@ -54,13 +54,13 @@ def refraction_gains(cosine: Array, ior: Array) -> Gains:
     return Gains(bend * bend / below, cosine / below)
 
 
-def joint(*lobes: tuple[Array, Array]) -> Array:
+def joint_concentration(*lobes: tuple[Array, Array]) -> Array:
     """Concentration of light that several lobes, each (kappa, gain), spread one after the other (Eqs. 17, 18, 21)."""
-    variances = (at_least(gain / kappa, LEAST_VARIANCE) for kappa, gain in lobes)
-    return concentration_of(*convolved(*(resultant(1.0 / variance) for variance in variances)))
+    variances = (clamp_min(gain / kappa, LEAST_VARIANCE) for kappa, gain in lobes)
+    return concentration_of(*convolve(*(resultant(1.0 / variance) for variance in variances)))
 
 
-def reflected(beam: Array, facets: Array, cosine: Array) -> Array:
+def reflect_beam(beam: Array, facets: Array, cosine: Array) -> Array:
     """Concentration of a beam after reflection at rough facets (Eq. 18; Eq. 12 for a beam without width).
 
     Args:
@@ -69,16 +69,16 @@ def reflected(beam: Array, facets: Array, cosine: Array) -> Array:
         cosine: between the means of both, in [0, 1].
     """
     gains = reflection_gains(cosine)
-    return joint((facets, gains.facets), (beam, gains.beam))
+    return joint_concentration((facets, gains.facets), (beam, gains.beam))
 
 
-def refracted(beam: Array, facets: Array, cosine: Array, ior: Array) -> Array:
+def refract_beam(beam: Array, facets: Array, cosine: Array, ior: Array) -> Array:
     """Concentration of a beam after refraction at rough facets (Eq. 21; Eq. 13 for a beam without width)."""
     gains = refraction_gains(cosine, ior)
-    return joint((facets, gains.facets), (beam, gains.beam))
+    return joint_concentration((facets, gains.facets), (beam, gains.beam))
 
 
-def extended(outgoing: Array, gains: Gains) -> Array:
+def extended_concentration(outgoing: Array, gains: Gains) -> Array:
     """Concentration of the normals that would send a beam without width where the light goes (Eqs. 19 and 22)."""
     return outgoing * gains.facets
 
@@ -89,7 +89,7 @@ def reflected_moment(beam: Array, facets: Array, cosine: Array) -> Array:
     share = turned / facets  # E[(o.m)^2] across the mean
     lost = 4.0 * share * (1.0 - share + (1.0 - 3.0 * share) * cosine * cosine)
     kept = safe_sqrt(1.0 - lost)
-    return concentration_of(*convolved((length, rest), (kept, lost / (1.0 + kept))))
+    return concentration_of(*convolve((length, rest), (kept, lost / (1.0 + kept))))
 
 
 def refraction_trace(beam: Array, facets: Array, cosine: Array, ior: Array) -> Array:
@@ -98,4 +98,4 @@ def refraction_trace(beam: Array, facets: Array, cosine: Array, ior: Array) -> A
     ratio = cosine / (ior * inside)
     by_facets = 0.5 * ((1.0 - ratio) ** 2 + (inside - cosine / ior) ** 2)
     by_beam = 0.5 * (ratio * ratio + 1.0 / (ior * ior))
-    return joint((facets, by_facets), (beam, by_beam))
+    return joint_concentration((facets, by_facets), (beam, by_beam))

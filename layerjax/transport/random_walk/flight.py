@@ -18,7 +18,7 @@ def free_flight(scene: Scene, path: PathState, free: Array, u: Array) -> tuple[P
     assert path.depth is not None
     down = path.direction[2] < 0
     rates, levels = scene.rates(path.direction), scene.fractions(path.layer, path.depth)
-    thickness = [choose(path.drawn_for, tau) if len(tau) > 1 else tau[0] for tau in scene.thickness]
+    thickness = [choose(path.sampling_channel, tau) if len(tau) > 1 else tau[0] for tau in scene.thickness]
     rest = -jnp.log(u)  # mean free paths still to go
     collides, medium, depth = ~free & free, jnp.zeros(u.shape, jnp.int32), path.depth
     crossed = [jnp.zeros_like(u)] * (last + 1)
@@ -45,16 +45,16 @@ def free_flight(scene: Scene, path: PathState, free: Array, u: Array) -> tuple[P
     path = path._replace(depth=depth, layer=None if path.layer is None else jnp.where(collides, medium, path.layer))
     chosen = None if last == 0 else medium
     if scene.colored_depths:
-        path = path._replace(ratios=_reweighed(scene, path, crossed, rates, collides, chosen))
+        path = path._replace(ratios=_reweight(scene, path, crossed, rates, collides, chosen))
     return path, collides, chosen
 
 
-def _reweighed(
+def _reweight(
     scene: Scene, path: PathState, crossed: list[Array], rates: list[Array], collides: Array, medium: Array | None
 ) -> Channels:
     """Densities of the path for every channel over that for the channel drawn for, after a flight."""
     tables = scene.thickness
-    drawn = [choose(path.drawn_for, tau) if len(tau) > 1 else tau[0] for tau in tables]
+    drawn = [choose(path.sampling_channel, tau) if len(tau) > 1 else tau[0] for tau in tables]
     ratios = []
     for c in range(scene.channels):
         excess = sum(
@@ -78,5 +78,5 @@ def boundary(scene: Scene, path: PathState, passes: Array) -> tuple[Array, Array
     inside = (surface >= 0) & (surface < scene.surfaces)
     arrives, escapes = passes & inside, passes & ~inside
     if path.facet is not None:
-        surface = jnp.where(path.facet.on, path.facet.surface, surface)
+        surface = jnp.where(path.facet.on_surface, path.facet.surface, surface)
     return arrives, escapes, jnp.clip(surface, 0, scene.surfaces - 1)

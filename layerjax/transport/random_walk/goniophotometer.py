@@ -14,12 +14,12 @@ from jax import Array
 from jax.typing import ArrayLike
 
 from layerjax._checks import require_choice, require_count, require_key
-from layerjax._numerics import broadcasting, horizon
-from layerjax._parameters import in_precision
+from layerjax._numerics import allow_broadcasting, horizon
+from layerjax._parameters import cast_arrays
 from layerjax._shapes import channel_count, require_single
 from layerjax.directions import read_directions, split
 from layerjax.stack import Stack, require_numbers, simplify
-from layerjax.transport.random_walk.batches import Record, added, follow, quotas, standard_error, upright
+from layerjax.transport.random_walk.batches import Record, follow, kahan_add, quotas, replace_invalid, standard_error
 from layerjax.transport.random_walk.random_numbers import key_words
 from layerjax.transport.random_walk.scene import Scene
 from layerjax.transport.random_walk.state import Step
@@ -57,7 +57,7 @@ class Goniogram(eqx.Module):
     azimuths: Array
 
 
-@broadcasting
+@allow_broadcasting
 def goniophotometer(
     stack: Stack,
     wi: ArrayLike,
@@ -96,7 +96,7 @@ def goniophotometer(
     require_choice("facet_multiple_scattering", facet_multiple_scattering, (False, True))
     require_key(key)
     (wi,) = read_directions(wi=wi)
-    slim = in_precision(simplify(stack), wi.dtype)
+    slim = cast_arrays(simplify(stack), wi.dtype)
     counts = (paths, polar, azimuth, orders, min(batch_size, paths))
     return _measure(slim, wi, channel_count(stack), key, counts, facet_multiple_scattering)
 
@@ -115,20 +115,20 @@ def _measure(
     scene = Scene(stack, channels, dtype)
     words = key_words(key)
     bins = 2 * polar * azimuth
-    owed, record = quotas(paths, batch_size), _recorder(polar, azimuth, orders)
+    quota, record = quotas(paths, batch_size), _recorder(polar, azimuth, orders)
 
     def one(question: tuple[Array, Array]) -> tuple[Array, Array]:
         index, direction = question
         w = split(direction)
         edge = horizon(dtype)
         valid = w[2] > edge if stack.base is not None else jnp.abs(w[2]) > edge
-        w = upright(w, valid)
+        w = replace_invalid(w, valid)
         spread = jnp.full(batch_size, w[0]), jnp.full(batch_size, w[1]), jnp.full(batch_size, w[2])
         walk = Walk(scene, spread, None, facet_multiple_scattering, count_orders=True)
         empty = [(jnp.zeros((rows, 2 * channels), dtype),) * 2 for rows in (bins, 2 * (orders + 1))]
-        lane = index.astype(jnp.uint32) * jnp.uint32(batch_size) + jnp.arange(batch_size, dtype=jnp.uint32)
-        remaining = jnp.where(valid, owed, 0)
-        (cells, _), (slots, _) = follow(walk, record, tuple(empty), lane, remaining, words, dtype)
+        walker = index.astype(jnp.uint32) * jnp.uint32(batch_size) + jnp.arange(batch_size, dtype=jnp.uint32)
+        remaining = jnp.where(valid, quota, 0)
+        (cells, _), (slots, _) = follow(walk, record, tuple(empty), walker, remaining, words, dtype)
         shaped = cells.reshape(2, polar, azimuth, channels, 2), slots.reshape(2, orders + 1, channels, 2)
         # the side of the light comes first
         near_cells, near_slots = (jnp.where(w[2] > 0, x, x[::-1]) for x in shaped)
@@ -154,9 +154,9 @@ def _recorder(polar: int, azimuth: int, orders: int) -> Record:
     """What adds light that leaves to sums of it and of its square, by direction and by number of events."""
     bins = 2 * polar * azimuth
 
-    def record(result: Any, step: Step, owes: Array) -> Any:
+    def record(result: Any, step: Step, active: Array) -> Any:
         by_direction, by_order = result
-        counted = step.escapes & owes
+        counted = step.escapes & active
         x, y, z = step.direction
         side = (z < 0).astype(jnp.int32)
         ring = jnp.minimum((jnp.abs(z) * polar).astype(jnp.int32), polar - 1)
@@ -172,9 +172,9 @@ def _recorder(polar: int, azimuth: int, orders: int) -> Record:
         def counted_in(running: tuple[Array, Array], place: Array) -> tuple[Array, Array]:
             sums, excess = running
             # where there are more places than paths at a time, each is met too seldom for its sum to lose anything
-            if sums.shape[0] > owes.size:
+            if sums.shape[0] > active.size:
                 return sums.at[place].add(rows, mode="drop"), excess
-            return added(running, jnp.zeros_like(sums).at[place].add(rows, mode="drop"))
+            return kahan_add(running, jnp.zeros_like(sums).at[place].add(rows, mode="drop"))
 
         return counted_in(by_direction, cell), counted_in(by_order, slot)
 

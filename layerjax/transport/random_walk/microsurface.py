@@ -11,27 +11,27 @@ import jax.numpy as jnp
 from jax import Array
 
 from layerjax import fresnel
-from layerjax.channels import Channels, each, per_channel
+from layerjax.channels import Channels, map_channels, per_channel
 from layerjax.directions import Vector, add, dot, flip, normalize, reflect, scale, select
 from layerjax.microsurface.heitz_walk import (
     escape_probability,
     facing_area,
-    height_overturned,
     meet_facet,
     next_height,
+    opposite_height,
     pass_through,
 )
 from layerjax.normals.ggx import ggx_density
 from layerjax.surfaces import Conductor
 from layerjax.surfaces.interface import refraction_lobe
 from layerjax.transport.random_walk.scene import Scene
-from layerjax.transport.random_walk.surfaces import Bounce, base_of, is_base, merge, roughness, turned
+from layerjax.transport.random_walk.surfaces import Bounce, base_of, is_base, merge, orient, roughness
 
 
 class Position(NamedTuple):
     """Where a path is on a microsurface."""
 
-    on: Array
+    on_surface: Array
     surface: Array
     height: Array
     entry: Vector
@@ -39,14 +39,14 @@ class Position(NamedTuple):
     entered_above: Array
 
 
-def away(travel: Vector) -> Position:
+def off_surface(travel: Vector) -> Position:
     """On no microsurface."""
     zero = jnp.zeros_like(travel[2])
     no = jnp.zeros(zero.shape, bool)
     return Position(no, jnp.zeros(zero.shape, jnp.int32), zero, travel, no)
 
 
-def applies(scene: Scene) -> bool:
+def has_microsurface(scene: Scene) -> bool:
     """Whether any surface of the scene has facets."""
     return bool(scene.interfaces) or isinstance(scene.base, Conductor)
 
@@ -87,8 +87,8 @@ def bounce(
     See `layerjax.transport.random_walk.surfaces.bounce`; what is sent to the target is what escapes the surface.
     """
     u1, u2, u3 = uniforms
-    wi = turned(travel, from_above, -1.0)
-    towards = None if target is None else turned(target, from_above)
+    wi = orient(travel, from_above, -1.0)
+    towards = None if target is None else orient(target, from_above)
     alpha = width(scene, surface)
     m, cosine = meet_facet(wi, alpha, u1, u2)
     at_base = is_base(scene, surface) if isinstance(scene.base, Conductor) else False
@@ -106,7 +106,7 @@ def bounce(
     if len(results) == 2:
         result, after = merge(at_base, results[1], results[0]), jnp.where(at_base, height, after)
     # directions are counted from where the ray is now: under the facets the surface is upside down
-    return result._replace(direction=turned(result.direction, from_above ^ result.crosses)), after
+    return result._replace(direction=orient(result.direction, from_above ^ result.crosses)), after
 
 
 def _meet_interface(
@@ -116,7 +116,7 @@ def _meet_interface(
     refracted, below, exists = pass_through(wi, m, ior, height)
     crosses = (u >= fresnel.dielectric(cosine, ior)) & exists
     wo = select(crosses, refracted, reflect(wi, m))
-    sent: Channels = () if towards is None else (_sent_by_interface(wi, towards, height, ior, alpha),)
+    sent: Channels = () if towards is None else (_interface_contribution(wi, towards, height, ior, alpha),)
     bounced = Bounce(sent, wo, crosses, (jnp.ones_like(cosine),), jnp.ones_like(crosses))
     return bounced, jnp.where(crosses, below, height)
 
@@ -127,23 +127,23 @@ def _meet_metal(
     """Reflection at a metal facet."""
     sent: Channels = ()
     if towards is not None:
-        lobe, between = _sent_by_mirror(wi, towards, height, alpha)
+        lobe, between = _mirror_contribution(wi, towards, height, alpha)
         sent = tuple(lobe * share for share in _reflectance(base, between))
     no = jnp.zeros(cosine.shape, bool)
     return Bounce(sent, reflect(wi, m), no, _reflectance(base, cosine), ~no)
 
 
-def _sent_by_interface(wi: Vector, wo: Vector, height: Array, ior: Array, alpha: Array) -> Array:
+def _interface_contribution(wi: Vector, wo: Vector, height: Array, ior: Array, alpha: Array) -> Array:
     """Light that a dielectric facet at this height, met along wi, sends to wo and out of the surface, 1/sr."""
-    lobe, cosine = _sent_by_mirror(wi, wo, height, alpha)
+    lobe, cosine = _mirror_contribution(wi, wo, height, alpha)
     reflected = lobe * fresnel.dielectric(jnp.minimum(cosine, 1.0), ior)
     facets, transmittance = refraction_lobe(wi, wo, ior, alpha)
-    escape = escape_probability(flip(wo), height_overturned(height), alpha)
+    escape = escape_probability(flip(wo), opposite_height(height), alpha)
     refracted = facets * transmittance / facing_area(scale(-1.0, wi), alpha) * escape
     return jnp.where(wo[2] > 0, reflected, jnp.where(facets > 0, refracted, 0.0))
 
 
-def _sent_by_mirror(wi: Vector, wo: Vector, height: Array, alpha: Array) -> tuple[Array, Array]:
+def _mirror_contribution(wi: Vector, wo: Vector, height: Array, alpha: Array) -> tuple[Array, Array]:
     """Light that a perfect mirror facet at this height, met along wi, sends to wo and out of the surface, 1/sr.
 
     Also the cosine of wi with the facet, by which Fresnel's reflectance is still to be taken.
@@ -159,4 +159,4 @@ def _sent_by_mirror(wi: Vector, wo: Vector, height: Array, alpha: Array) -> tupl
 def _reflectance(base: Conductor, cosine: Array) -> Channels:
     ior, k = per_channel(base.ior), per_channel(base.k)
     cosine = jnp.minimum(cosine, 1.0)
-    return each(lambda ior, k: fresnel.conductor(cosine, ior, k), ior, k)
+    return map_channels(lambda ior, k: fresnel.conductor(cosine, ior, k), ior, k)

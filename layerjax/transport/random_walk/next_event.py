@@ -24,7 +24,7 @@ from layerjax.transport.random_walk.state import Aim, Arrival, Event, PathState,
 
 
 class Goal(NamedTuple):
-    """The requested direction of the light, lane by lane, and what follows from it once."""
+    """The requested direction of the light, one a walker, and what follows from it once."""
 
     wo: Vector
     above: Array
@@ -191,7 +191,7 @@ def contribution(
     scene: Scene, goal: Goal, path: PathState, arrival: Arrival, event: Event, target: Target, orders: str
 ) -> Channels:
     """What the event adds to the BSDF at (wi, wo): what it sends to the target, and what of that arrives at wo."""
-    counted = _counted(path, arrival, target, orders)
+    counted = _is_counted(path, arrival, target, orders)
     factors: Channels = (1.0 / jnp.abs(goal.wo[2]),)
     ends: list[Any] = [jnp.where(goal.above, 0.0, 1.0)] * len(scene.media)  # of the way to wo or to the exit
     rates = goal.rates
@@ -211,7 +211,7 @@ def contribution(
         rates = [jnp.where(direct, a, b) for a, b in zip(rates, path.aim.rates, strict=True)]
     elif event.rivals is not None:  # no interface: light that the base sends to wo
         factors = (factors[0] / event.rivals,)
-    passed = _passed(scene, path, ends, rates)
+    passed = _transmitted(scene, path, ends, rates)
     weight = weights(path)
     return tuple(
         jnp.where(counted, weight[c] * pick(event.sent, c) * pick(factors, c) * pick(passed, c), 0.0)
@@ -219,7 +219,7 @@ def contribution(
     )
 
 
-def relayed(scene: Scene, goal: Goal, path: PathState, arrival: Arrival, event: Event) -> Channels:
+def relay_contribution(scene: Scene, goal: Goal, path: PathState, arrival: Arrival, event: Event) -> Channels:
     """What the event adds to the BSDF by the relay, where light from it travels to the surface opposite."""
     assert path.relay is not None
     assert path.aiming is not None
@@ -232,7 +232,7 @@ def relayed(scene: Scene, goal: Goal, path: PathState, arrival: Arrival, event: 
         near = jnp.where(jnp.asarray(arrival.at_surface), arrival.surface == goal.exit, path.region == goal.inner)
         level = choose(goal.opposite, [jnp.int32(level) for level in scene.levels])
     ends = [jnp.where(level > j, 1.0, 0.0) for j in range(len(scene.media))]
-    passed = _passed(scene, path, ends, path.relay.rates)
+    passed = _transmitted(scene, path, ends, path.relay.rates)
     share = 1.0 / (1.0 + event.relayed_density * path.relay.rivals)  # balance heuristic
     share = share if path.aim is not None else share / jnp.abs(goal.wo[2])
     weight, counted = weights(path), happens & near & ~path.aiming
@@ -249,7 +249,7 @@ def relayed(scene: Scene, goal: Goal, path: PathState, arrival: Arrival, event: 
     )
 
 
-def _passed(scene: Scene, path: PathState, ends: list[Any], rates: list[Array]) -> Channels:
+def _transmitted(scene: Scene, path: PathState, ends: list[Any], rates: list[Array]) -> Channels:
     """Transmittance from where the path is to other positions."""
     if not scene.media or path.depth is None:
         return (jnp.ones_like(path.direction[2]),)
@@ -257,7 +257,7 @@ def _passed(scene: Scene, path: PathState, ends: list[Any], rates: list[Array]) 
     return scene.transmittance([jnp.abs(a - b) for a, b in zip(levels, ends, strict=True)], rates)
 
 
-def _counted(path: PathState, arrival: Arrival, target: Target, orders: str) -> Array:
+def _is_counted(path: PathState, arrival: Arrival, target: Target, orders: str) -> Array:
     """Whether there is an event whose light can arrive at wo, and is of a requested order."""
     counted = arrival.collides if arrival.at_surface is None else arrival.collides | arrival.at_surface
     direct, through = target.direct, target.through_exit

@@ -1,7 +1,7 @@
 """Random numbers of the walk: a counter-based hash, stateless but for a counter.
 
 PCG4D (Jarzynski & Olano 2020, "Hash functions for GPU rendering", JCGT 9(3)) turns four 32-bit words into four. The
-words are (counter, lane, key, key): every lane has its own stream of 2^32 blocks, and no stream overlaps
+words are (counter, walker, key, key): every walker has its own stream of 2^32 blocks, and no stream overlaps
 another. A block of four numbers costs a dozen integer products, which is a fraction of what threefry takes.
 """
 
@@ -26,8 +26,8 @@ def key_words(key: Array) -> tuple[Array, Array]:
     return words[0], words[1]
 
 
-def uniforms(counter: Array, lane: Array, key: tuple[Array, Array], blocks: int, dtype: jnp.dtype) -> list[Array]:
-    """4 * `blocks` numbers in (0, 1) for each lane, from its counter (which the caller raises by one a call).
+def uniforms(counter: Array, walker: Array, key: tuple[Array, Array], blocks: int, dtype: jnp.dtype) -> list[Array]:
+    """4 * `blocks` numbers in (0, 1) for each walker, from its counter (which the caller raises by one a call).
 
     They are multiples of 2^-32 plus a half of that: never 0, so that a logarithm is finite, and at most 1 (which only
     rounding to float32 can reach).
@@ -36,7 +36,7 @@ def uniforms(counter: Array, lane: Array, key: tuple[Array, Array], blocks: int,
     half = jnp.asarray(2.0**-33, dtype)
     numbers: list[Array] = []
     for block in range(blocks):
-        words = pcg4d(counter * jnp.uint32(blocks) + jnp.uint32(block), lane, *key)
+        words = pcg4d(counter * jnp.uint32(blocks) + jnp.uint32(block), walker, *key)
         numbers += [word.astype(dtype) * scale + half for word in words]
     return numbers
 

@@ -1,8 +1,9 @@
 """A stack as the walk sees it: tables of media, regions between interfaces, and positions in depth.
 
 What is fixed while tracing (which layers there are, which of them share a phase function) is Python; what differs from
-lane to lane is chosen by index among the few layers. A position is (layer, depth): `depth` in [0, 1] is the share of
-that medium that lies above it. Keeping the layer apart keeps the digits of a position in a thin layer under thick ones.
+walker to walker is chosen by index among the few layers. A position is (layer, depth): `depth` in [0, 1] is the share
+of that medium that lies above it. Keeping the layer apart keeps the digits of a position in a thin layer under thick
+ones.
 """
 
 from collections.abc import Sequence
@@ -22,7 +23,7 @@ from layerjax.transport.random_walk.random_numbers import circle
 
 
 def choose(index: Array | None, values: Sequence[Any]) -> Any:
-    """The value with that index, lane by lane; None is index 0 of a table of one."""
+    """The value with that index, walker by walker; None is index 0 of a table of one."""
     result = values[0]
     for j, value in enumerate(values[1:], 1):
         result = jnp.where(index == j, value, result)
@@ -98,7 +99,7 @@ class Scene:
         density = jnp.zeros_like(wi[2])
         shared = any(medium.phase.uses_half_vector for medium in self.media)
         half = half_vector(wi, wo) if shared or self._fresnel() else None
-        for members, phase in self._merged(medium):
+        for members, phase in self._merge_media(medium):
             if phase.uses_half_vector and half is not None:
                 value = phase.kernel(wi, wo, half[0]) / areas
             else:
@@ -109,9 +110,9 @@ class Scene:
     def deflect(self, medium: Array | None, wi: Vector, u1: Array, u2: Array) -> tuple[Vector, Channels]:
         """A direction drawn from the phase function, and the share that is kept."""
         wo: Vector = wi
-        for members, phase in self._merged(medium):
+        for members, phase in self._merge_media(medium):
             deflection = phase.deflection(u1)
-            drawn = phase.sample(wi, u1, u2) if deflection is None else _deflected(wi, *deflection, u2)
+            drawn = phase.sample(wi, u1, u2) if deflection is None else _deflect(wi, *deflection, u2)
             wo = drawn if len(self.groups) == 1 else select(_is_in(medium, members), drawn, wo)
         if not self._fresnel():
             return wo, self._scattered_share(medium, None)
@@ -138,7 +139,7 @@ class Scene:
             shares.append(jnp.asarray(share, self.dtype))
         return tuple(shares)
 
-    def _merged(self, medium: Array | None) -> list[tuple[list[int], PhaseFunction]]:
+    def _merge_media(self, medium: Array | None) -> list[tuple[list[int], PhaseFunction]]:
         return [(members, _merge(medium, members, self.media)) for members in self.groups]
 
     # surfaces
@@ -150,8 +151,8 @@ class Scene:
         return jnp.where(from_above, below, above) / jnp.where(from_above, above, below)
 
 
-def _deflected(wi: Vector, cosine: Array, sine: Array, u2: Array) -> Vector:
-    """`layerjax.phase.contract.deflected`, with the azimuth from a polynomial: the innermost work of most walks."""
+def _deflect(wi: Vector, cosine: Array, sine: Array, u2: Array) -> Vector:
+    """`layerjax.phase.contract.deflect`, with the azimuth from a polynomial: the innermost work of most walks."""
     axis = scale(-1.0, wi)
     tangent, bitangent = frame(axis)
     c, s = circle(u2)
@@ -169,7 +170,7 @@ def _groups(phases: Sequence[PhaseFunction]) -> list[list[int]]:
 
 
 def _merge(medium: Array | None, members: Sequence[int], media: Sequence[Any]) -> PhaseFunction:
-    """One phase function whose parameters are those of the lane's medium."""
+    """One phase function whose parameters are those of the medium that each walker is in."""
     phases = [media[j].phase for j in members]
     if len(phases) == 1:
         return phases[0]

@@ -44,7 +44,7 @@ class PathState(NamedTuple):
     throughput: Channels
     ratios: Channels
     """Density of the path for each channel over that for the channel that draws."""
-    drawn_for: Array | None
+    sampling_channel: Array | None
     """Channel that draws the distances."""
     order: Array | None
     """Number of events so far."""
@@ -114,7 +114,7 @@ class Step(NamedTuple):
     order: Array | None
 
 
-def to_level(scene: Scene, path: PathState, at_surface: Array, surface: Array | None) -> PathState:
+def move_to_surface(scene: Scene, path: PathState, at_surface: Array, surface: Array | None) -> PathState:
     """Paths at a surface, placed there."""
     if path.depth is None:
         return path

@@ -15,8 +15,8 @@ from jax import Array
 
 from layerjax._numerics import safe_div
 from layerjax.channels import Channels, pick
-from layerjax.directions import Vector, sanitised, select
-from layerjax.normals.facets import Distribution, draw_weight, masking, twice_seen
+from layerjax.directions import Vector, sanitise, select
+from layerjax.normals.facets import Distribution, draw_weight, masking, twice_projected_area
 from layerjax.surfaces import Conductor, Surface
 from layerjax.surfaces.interface import (
     facet_normal,
@@ -55,7 +55,7 @@ def base_of(scene: Scene) -> Surface | None:
     return eqx.tree_at(lambda base: (base.ior, base.k), scene.base, (scene.base.ior / above, scene.base.k / above))
 
 
-def turned(w: Vector, from_above: Array, sign: float = 1.0) -> Vector:
+def orient(w: Vector, from_above: Array, sign: float = 1.0) -> Vector:
     """w (times the sign) with z positive on the side that light arrives from."""
     return sign * w[0], sign * w[1], jnp.where(from_above, sign * w[2], -sign * w[2])
 
@@ -85,10 +85,10 @@ def bounce(
 
     Args:
         target: a direction of travel away from the surface requested of the scattered light, or None.
-        refracts: lanes that are to refract wherever that is possible (their `weight` then lacks the transmittance).
+        refracts: walkers that are to refract wherever that is possible (their `weight` then lacks the transmittance).
     """
-    wi = _facing(turned(travel, from_above, -1.0))
-    towards = None if target is None else turned(target, from_above)
+    wi = _clamp_to_upper(orient(travel, from_above, -1.0))
+    towards = None if target is None else orient(target, from_above)
     u1, u2, u3 = uniforms
     at_base = is_base(scene, surface)
     results = []
@@ -112,17 +112,17 @@ def bounce(
         assert base is not None
         wo = base.sample(wi, u1, u2)
         leaves = wo[2] > 0
-        inside = _facing(wo)
+        inside = _clamp_to_upper(wo)
         share = tuple(_weight(f * inside[2], base.pdf(wi, inside), base) for f in base.evaluate(wi, inside))
         value: Channels = () if towards is None else base_towards(base, wi, towards)
         results.append(Bounce(value, wo, jnp.zeros_like(leaves), share, leaves))
     result = results[0] if len(results) == 1 else merge(at_base, results[1], results[0])
-    return result._replace(direction=turned(result.direction, from_above))
+    return result._replace(direction=orient(result.direction, from_above))
 
 
 def base_towards(base: Surface, wi: Vector, towards: Vector) -> Channels:
     """Light that the base sends to a direction, per solid angle; 0 below it."""
-    inside = _facing(towards)
+    inside = _clamp_to_upper(towards)
     return tuple(jnp.where(towards[2] > 0, f * inside[2], 0.0) for f in base.evaluate(wi, inside))
 
 
@@ -146,7 +146,7 @@ def density(
     scene: Scene, surface: Array | None, from_above: Array, travel: Vector, onward: Vector, *, diffuse: bool
 ) -> Array:
     """Density, 1/sr, with which `bounce` turns `travel` into `onward`; with `diffuse`, a stand-in that is never 0."""
-    wi, wo = _facing(turned(travel, from_above, -1.0)), turned(onward, from_above)
+    wi, wo = _clamp_to_upper(orient(travel, from_above, -1.0)), orient(onward, from_above)
     at_base = is_base(scene, surface)
     value: Array | None = None
     if at_base is not True:
@@ -159,7 +159,7 @@ def density(
     if at_base is not False:
         base = base_of(scene)
         assert base is not None
-        below = jnp.where(wo[2] > 0, base.pdf(wi, _facing(wo)), 0.0)
+        below = jnp.where(wo[2] > 0, base.pdf(wi, _clamp_to_upper(wo)), 0.0)
         value = below if value is None else jnp.where(at_base, below, value)
     assert value is not None
     return value + DIFFUSE_SHARE * jnp.abs(wo[2]) / jnp.pi if diffuse else value
@@ -169,7 +169,7 @@ def interface_towards(
     scene: Scene, surface: Array | None, from_above: Array, travel: Vector, target: Vector
 ) -> tuple[Array, Array]:
     """What an interface sends to a direction of travel, per solid angle, and the density with which it is drawn."""
-    wi, towards = _facing(turned(travel, from_above, -1.0)), turned(target, from_above)
+    wi, towards = _clamp_to_upper(orient(travel, from_above, -1.0)), orient(target, from_above)
     ior, alpha = scene.surface_ior(surface, from_above), roughness(scene, surface)
 
     def sent(distribution: Distribution) -> tuple[Array, Array]:
@@ -187,13 +187,13 @@ def exit_density(
     Both directions point away from the interface; `above` says on which side `leaving` lies. Also the transmittance of
     the facet, G1 / cos of `inside` and what the draw weighs, multiplied.
     """
-    wi, wo = turned(leaving, above), turned(inside, above)
+    wi, wo = orient(leaving, above), orient(inside, above)
     ior, alpha = scene.surface_ior(surface, above), roughness(scene, surface)
 
     def drawn(distribution: Distribution) -> tuple[Array, Array]:
         lobe, transmittance = refraction_lobe(wi, wo, ior, alpha, distribution)
-        value = jnp.where(wo[2] < 0, 2.0 * lobe / twice_seen(wi[2], wi, alpha, distribution), 0.0)
-        passed = transmittance * 2.0 / twice_seen(jnp.abs(wo[2]), wo, alpha, distribution)
+        value = jnp.where(wo[2] < 0, 2.0 * lobe / twice_projected_area(wi[2], wi, alpha, distribution), 0.0)
+        passed = transmittance * 2.0 / twice_projected_area(jnp.abs(wo[2]), wo, alpha, distribution)
         if distribution == "ggx":
             return value, passed
         weight = draw_weight(wi, facet_normal(wi, wo, ior), alpha)
@@ -224,11 +224,11 @@ def _weight(value: Array, density: Array, base: Surface) -> Array:
 def _interface(wi: Vector, wo: Vector, ior: Array, alpha: Array, distribution: Distribution) -> Array:
     """BSDF of an interface, of whichever kind the side of wo asks for."""
     above = wo[2] > 0
-    reflected = interface_reflection(wi, sanitised(wo, above), ior, alpha, distribution)
+    reflected = interface_reflection(wi, sanitise(wo, above), ior, alpha, distribution)
     refracted = interface_transmission(wi, (wo[0], wo[1], jnp.where(above, -0.5, wo[2])), ior, alpha, distribution)
     return jnp.where(above, reflected, refracted)
 
 
-def _facing(w: Vector) -> Vector:
+def _clamp_to_upper(w: Vector) -> Vector:
     """w with its z kept above 0: rounding may leave it in the plane of the surface."""
     return w[0], w[1], jnp.maximum(w[2], 1e-12)

@@ -14,12 +14,12 @@ from jax import Array
 from layerjax._checks import require_choice, require_count
 from layerjax._numerics import horizon
 from layerjax.channels import Channels
-from layerjax.directions import Vector, flip, half_vector, reflect, sanitised, select
+from layerjax.directions import Vector, flip, half_vector, reflect, sanitise, select
 from layerjax.normals.facets import reflection_pdf, sample
 from layerjax.stack import Interface, Stack
 from layerjax.surfaces.lambertian import sample_cosine
 from layerjax.transport.contract import RandomTransport, Side, refuse_vmf
-from layerjax.transport.random_walk.batches import average, upright
+from layerjax.transport.random_walk.batches import average, replace_invalid
 from layerjax.transport.random_walk.scene import Scene
 from layerjax.transport.random_walk.state import Step
 from layerjax.transport.random_walk.walk import Orders, Walk
@@ -70,7 +70,7 @@ class RandomWalk(RandomTransport):
             valid = valid & (wi[2] > 0) & (wo[2] > 0)
         if side == "transmission":
             valid = valid & (wi[2] * wo[2] < 0)
-        wi, wo = upright(wi, valid), upright(wo, valid)
+        wi, wo = replace_invalid(wi, valid), replace_invalid(wo, valid)
 
         def walk(wi: Vector, wo: Vector) -> Walk:
             return Walk(scene, wi, wo, self.facet_multiple_scattering, self.orders)
@@ -98,7 +98,7 @@ class RandomWalk(RandomTransport):
             return (*upwards, *downwards)
 
         value, error = average(
-            walk, tally, 2 * channels, (upright(wi, valid),), valid, self.paths, self.batch_size, key
+            walk, tally, 2 * channels, (replace_invalid(wi, valid),), valid, self.paths, self.batch_size, key
         )
         above = (wi[2] > 0)[:, None]
 
@@ -110,7 +110,7 @@ class RandomWalk(RandomTransport):
     def sample(self, state: Stack, wi: Vector, uniforms: tuple[Array, Array, Array]) -> Vector:
         u, u1, u2 = uniforms
         side = jnp.where(wi[2] < 0, -1.0, 1.0)
-        local = sanitised((wi[0], wi[1], wi[2] * side))
+        local = sanitise((wi[0], wi[1], wi[2] * side))
         near, far = _diffuse_shares(state)
         cosine = sample_cosine(u1, u2)
         wo = select(u < near, cosine, flip(cosine))
@@ -122,7 +122,7 @@ class RandomWalk(RandomTransport):
 
     def pdf(self, state: Stack, wi: Vector, wo: Vector) -> Array:
         side = jnp.where(wi[2] < 0, -1.0, 1.0)
-        local, towards = sanitised((wi[0], wi[1], wi[2] * side)), (wo[0], wo[1], wo[2] * side)
+        local, towards = sanitise((wi[0], wi[1], wi[2] * side)), (wo[0], wo[1], wo[2] * side)
         near, far = _diffuse_shares(state)
         density = jnp.where(towards[2] > 0, near, far) * jnp.abs(towards[2]) / jnp.pi
         facets = _facets(state)

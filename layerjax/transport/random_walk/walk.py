@@ -32,11 +32,20 @@ from layerjax.transport.random_walk.next_event import (
     meet_opposite,
     no_aim,
     no_relay,
-    relayed,
+    relay_contribution,
     start_aiming,
 )
 from layerjax.transport.random_walk.scene import Scene
-from layerjax.transport.random_walk.state import Arrival, Event, PathState, Step, Target, merge, to_level, weights
+from layerjax.transport.random_walk.state import (
+    Arrival,
+    Event,
+    PathState,
+    Step,
+    Target,
+    merge,
+    move_to_surface,
+    weights,
+)
 
 Orders = Literal["all", "first", "multiple"]
 
@@ -69,7 +78,7 @@ class Walk:
         self.wi = wi
         self.orders: Orders = orders
         self.counts = count_orders or orders != "all"
-        self.multiple = multiple and microsurface.applies(scene)
+        self.multiple = multiple and microsurface.has_microsurface(scene)
         self.goal = None if wo is None else make_goal(scene, wo)
         self.aims = wo is not None and bool(scene.interfaces) and orders != "first"
         # where two surfaces enclose a region, light from one may be aimed through the other
@@ -95,7 +104,7 @@ class Walk:
         if self.goal is not None and target is not None:
             arrived = contribution(self.scene, self.goal, path, arrival, event, target, self.orders)
             if self.relays:
-                more = relayed(self.scene, self.goal, path, arrival, event)
+                more = relay_contribution(self.scene, self.goal, path, arrival, event)
                 arrived = tuple(a + b for a, b in zip(arrived, more, strict=True))
         path, ends = self._continue(path, arrival, event, u)
         return path, Step(arrived, ends, *outside)
@@ -124,13 +133,13 @@ class Walk:
             region=jnp.where(above, index, scene.regions - 1) if scene.regions > 1 else None,
             throughput=(one,) * scene.channels,
             ratios=(one,) * scene.channels if scene.colored_depths else (),
-            drawn_for=drawn if scene.colored_depths else None,
+            sampling_channel=drawn if scene.colored_depths else None,
             order=index if self.counts else None,
             aiming=above & ~above if self.aims or self.relays else None,
             aim=no_aim(scene, direction) if self.aims else None,
             relay=no_relay(scene, direction) if self.relays else None,
             inverse_density=zero if self.mixes else None,
-            facet=microsurface.away(direction) if self.multiple else None,
+            facet=microsurface.off_surface(direction) if self.multiple else None,
         )
 
     def _free_flight(self, path: PathState, u: list[Array]) -> tuple[PathState, Arrival]:
@@ -138,7 +147,7 @@ class Walk:
         scene = self.scene
         free = jnp.ones(u[0].shape, bool)
         free = free if path.aiming is None else free & ~path.aiming
-        free = free if path.facet is None else free & ~path.facet.on
+        free = free if path.facet is None else free & ~path.facet.on_surface
         path, collides, medium = free_flight(scene, path, free, u[0])
         arrives, escapes, surface = boundary(scene, path, free & ~collides)
         if path.order is not None:
@@ -146,7 +155,9 @@ class Walk:
         if not scene.surfaces:
             return path, Arrival(collides, medium, None, None, escapes)
         at_surface = arrives | ~free
-        return to_level(scene, path, at_surface, surface), Arrival(collides, medium, at_surface, surface, escapes)
+        return move_to_surface(scene, path, at_surface, surface), Arrival(
+            collides, medium, at_surface, surface, escapes
+        )
 
     def _scatter(
         self, path: PathState, arrival: Arrival, target: Target | None, u: list[Array]
@@ -247,17 +258,17 @@ class Walk:
         """
         scene, travel, surface, at_surface = self.scene, path.direction, arrival.surface, arrival.at_surface
         assert at_surface is not None
-        begins = at_surface & ~facet.on
+        begins = at_surface & ~facet.on_surface
         entry = select(begins, travel, facet.entry)
         entered_above = jnp.where(begins, from_above, facet.entered_above)
         alpha = microsurface.width(scene, surface)
         first, _ = microsurface.free_flight(
-            surfaces.turned(travel, from_above), jnp.zeros_like(u[0]), alpha, -jnp.log(u[5])
+            surfaces.orient(travel, from_above), jnp.zeros_like(u[0]), alpha, -jnp.log(u[5])
         )
         height = jnp.where(begins, first, facet.height)
         walked, height = microsurface.bounce(scene, surface, from_above, travel, height, towards, (u[1], u[2], u[4]))
         side = from_above ^ walked.crosses
-        height, left = microsurface.free_flight(surfaces.turned(walked.direction, side), height, alpha, -jnp.log(u[6]))
+        height, left = microsurface.free_flight(surfaces.orient(walked.direction, side), height, alpha, -jnp.log(u[6]))
         if scene.interfaces:  # nothing is refracted between equal indices: light passes at the first facet
             left = left | (walked.crosses & (scene.surface_ior(surface, from_above) == 1.0))
         faceted = microsurface.has_facets(scene, surface)

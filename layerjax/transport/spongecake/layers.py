@@ -10,7 +10,7 @@ from layerjax.directions import Vector
 from layerjax.phase import PhaseFunction
 from layerjax.stack import Medium
 
-MOST = 2
+MOST_MEDIA = 2
 """Media that a network is trained for, as in Sec. 5."""
 
 
@@ -21,14 +21,14 @@ def pair_of(media: tuple[Medium, ...]) -> tuple[Medium, ...]:
     the normal, and its albedo becomes the mean over both.
     """
     with jax.ensure_compile_time_eval():  # numbers that are known stay known while a program is traced
-        while len(media) > MOST:
+        while len(media) > MOST_MEDIA:
             strengths = [float(np.mean(_scattering(medium))) for medium in media]
             at = min(range(len(media) - 1), key=lambda k: min(strengths[k], strengths[k + 1]))
-            media = (*media[:at], _together(media[at], media[at + 1]), *media[at + 2 :])
+            media = (*media[:at], _merge(media[at], media[at + 1]), *media[at + 2 :])
     return media
 
 
-def _together(one: Medium, other: Medium) -> Medium:
+def _merge(one: Medium, other: Medium) -> Medium:
     keeper, guest = sorted((one, other), key=lambda medium: -float(np.mean(_scattering(medium))))
     depths = [jnp.asarray(medium.thickness) * _area(medium.phase) for medium in (keeper, guest)]
     albedos = [jnp.asarray(medium.albedo) * _scattered_share(medium) for medium in (keeper, guest)]

@@ -28,7 +28,12 @@ from layerjax.quadrature import gauss_legendre
 from layerjax.stack import Medium
 from layerjax.transport.contract import Side
 from layerjax.transport.single_scattering import Media, is_valid_pair, layer_lobes
-from layerjax.transport.spongecake.bending import Bend, coefficients_of, factors, share_of
+from layerjax.transport.spongecake.energy_correction import (
+    EnergyCorrection,
+    coefficients_of,
+    correction_factors,
+    correction_share,
+)
 from layerjax.transport.spongecake.mapping import Numbers, Weights, shape_of, weights_of
 
 ABOVE, BELOW, THROUGH = range(3)
@@ -58,21 +63,24 @@ class BlurredSGGX(SGGX):
 class SecondLobe(eqx.Module):
     """What several collisions leave. slab: media with other parameters and no albedo of their own.
 
-    weights: for each channel, see `layerjax.transport.spongecake.mapping.Weights`, stacked (C, ...). bend: a factor c
-    of either direction, see `layerjax.transport.spongecake.bending`; None for 1.
+    weights: for each channel, see `layerjax.transport.spongecake.mapping.Weights`, stacked (C, ...).
+    energy_correction: a factor c of either direction, see `layerjax.transport.spongecake.energy_correction`; None: 1.
     """
 
     slab: Media
     weights: Weights
-    bend: Bend | None = None
+    energy_correction: EnergyCorrection | None = None
 
 
 def second_lobe(
-    media: tuple[Medium, ...], networks: Mapping[int, eqx.nn.MLP], bends: Mapping[int, eqx.nn.MLP] | None = None
+    media: tuple[Medium, ...],
+    networks: Mapping[int, eqx.nn.MLP],
+    correction_networks: Mapping[int, eqx.nn.MLP] | None = None,
 ) -> SecondLobe:
-    """The second lobe of one medium or two, by networks for so many; without `bends` its energy is left as it is."""
+    """The second lobe of one medium or two, by networks for so many; without `correction_networks` its energy
+    is left as it is."""
     dtype = jnp.result_type(*jax.tree.leaves(media))
-    net = _of_type(networks[len(media)], dtype)
+    net = _cast(networks[len(media)], dtype)
     channels = max(count(*(per_channel(jnp.asarray(value)) for value in _optics(medium))) for medium in media)
     numbers = [_numbers(media, c, dtype) for c in range(channels)]
     albedo = mean([number.albedo for number in numbers])
@@ -93,12 +101,12 @@ def second_lobe(
         plain = Medium(thickness, 1.0, phase)
         slab.append(eqx.tree_at(lambda m: m.albedo, plain, 1.0))  # known: nothing to multiply by
     weights = [weights_of(net, number, albedo, f0) for number in numbers]
-    bend = None
-    if bends is not None:
-        turning, bending = has_axes(media), _of_type(bends[len(media)], dtype)
-        found = [coefficients_of(bending, number, turning) for number in (numbers if coloured else numbers[:1])]
-        bend = Bend(jnp.stack(found), share_of(media).astype(dtype))
-    return SecondLobe(Media(tuple(slab), None), jax.tree.map(lambda *each: jnp.stack(each), *weights), bend)
+    correction = None
+    if correction_networks is not None:
+        anisotropic, network = has_axes(media), _cast(correction_networks[len(media)], dtype)
+        found = [coefficients_of(network, number, anisotropic) for number in (numbers if coloured else numbers[:1])]
+        correction = EnergyCorrection(jnp.stack(found), correction_share(media).astype(dtype))
+    return SecondLobe(Media(tuple(slab), None), jax.tree.map(lambda *each: jnp.stack(each), *weights), correction)
 
 
 def has_learned(phase: PhaseFunction) -> bool:
@@ -112,7 +120,7 @@ def has_axes(media: tuple[Medium, ...]) -> bool:
     return any(each is not None and each.axis is not None for each in flakes)
 
 
-def _of_type(net: eqx.nn.MLP, dtype: Any) -> eqx.nn.MLP:
+def _cast(net: eqx.nn.MLP, dtype: Any) -> eqx.nn.MLP:
     return jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype) if eqx.is_inexact_array(leaf) else leaf, net)
 
 
@@ -120,10 +128,10 @@ def evaluate_second(second: SecondLobe, wi: Vector, wo: Vector, side: Side, opaq
     """BSDF of what several collisions leave. opaque: there is a base, and light from above alone is is_valid_pair."""
     terms = [_level(second, wi, wo, side, opaque), *_lobes(second, wi, wo, side, opaque).values()]
     values = tuple(sum((term[c] for term in terms[1:]), terms[0][c]) for c in range(len(terms[0])))
-    if second.bend is None:
+    if second.energy_correction is None:
         return values
-    bent = factors(second.bend, wi, wo, opaque or side == "reflection")
-    return tuple(value * pick(bent, c) for c, value in enumerate(values))
+    factors = correction_factors(second.energy_correction, wi, wo, opaque or side == "reflection")
+    return tuple(value * pick(factors, c) for c, value in enumerate(values))
 
 
 def _lobes(second: SecondLobe, wi: Vector, wo: Vector, side: Side, opaque: bool) -> dict[int, Channels]:
@@ -131,14 +139,14 @@ def _lobes(second: SecondLobe, wi: Vector, wo: Vector, side: Side, opaque: bool)
     _, cosine = half_vector(wi, wo)
     edge = (1.0 - cosine) ** 2
     edge = edge * edge * (1.0 - cosine)  # Schlick's term
-    rises = [rise**2 for rise in _rises(wi, wo)]
+    rises = [rise**2 for rise in _slope_variables(wi, wo)]
     rises = [rise * rise for rise in rises]
-    rims = [_rising(second.weights.rims[c], rises, wi, wo, side, opaque) for c in range(_channels(second))]
+    rims = [_slope_factor(second.weights.rims[c], rises, wi, wo, side, opaque) for c in range(_channels(second))]
     found = {}
     for k, lobe in layer_lobes(second.slab, wi, wo, "reflection" if opaque else side).items():
         values = []
         for c, rim in enumerate(rims):
-            plain, more = (_of_side(second.weights.lobes[c, :, k, n], wi, wo, side, opaque) for n in (0, 1))
+            plain, more = (_side_weight(second.weights.lobes[c, :, k, n], wi, wo, side, opaque) for n in (0, 1))
             values.append((plain + more * edge) * rim * pick(lobe, c))  # W_1 of Sec. 5 times Eqs. (11) and (16)
         found[k] = tuple(values)
     return found
@@ -147,23 +155,23 @@ def _lobes(second: SecondLobe, wi: Vector, wo: Vector, side: Side, opaque: bool)
 def _level(second: SecondLobe, wi: Vector, wo: Vector, side: Side, opaque: bool) -> Channels:
     """The Lambertian term, for all channels."""
     valid = is_valid_pair(wi, wo, side, opaque)
-    rises = _rises(wi, wo)
+    rises = _slope_variables(wi, wo)
     values = []
     for c in range(_channels(second)):
-        level = _of_side(second.weights.levels[c], wi, wo, side, opaque)
-        slope = _rising(second.weights.slopes[c], rises, wi, wo, side, opaque)
+        level = _side_weight(second.weights.levels[c], wi, wo, side, opaque)
+        slope = _slope_factor(second.weights.slopes[c], rises, wi, wo, side, opaque)
         values.append(jnp.where(valid, level * slope, 0.0))  # W_2 of Sec. 5
     return tuple(values)
 
 
-def _rises(wi: Vector, wo: Vector) -> tuple[Array, Array]:
+def _slope_variables(wi: Vector, wo: Vector) -> tuple[Array, Array]:
     """1 - |cos| of both directions; if they are on different sides, of the upper one first."""
     into, out = (1.0 - jnp.abs(w[2]) for w in (wi, wo))
     above = wi[2] > 0
     return jnp.where(above, into, out), jnp.where(above, out, into)
 
 
-def _rising(slopes: Array, rises: Sequence[Array], wi: Vector, wo: Vector, side: Side, opaque: bool) -> Array:
+def _slope_factor(slopes: Array, rises: Sequence[Array], wi: Vector, wo: Vector, side: Side, opaque: bool) -> Array:
     """(1 + slope rise) of both directions, with the slopes that hold for their sides, (2, 2) as in `Weights`."""
     high, low = slopes[1]
     if opaque or side == "reflection":
@@ -179,9 +187,9 @@ def second_albedo(second: SecondLobe, wi: Vector, nodes: int, opaque: bool) -> t
     spread: Vector = (wi[0][..., None], wi[1][..., None], wi[2][..., None])
     near, far = [], []
     for wo, values in flux(second, wi, nodes, opaque):
-        if second.bend is not None:
-            bent = factors(second.bend, spread, wo, opaque)
-            values = tuple(value * pick(bent, c) for c, value in enumerate(values))
+        if second.energy_correction is not None:
+            factors = correction_factors(second.energy_correction, spread, wo, opaque)
+            values = tuple(value * pick(factors, c) for c, value in enumerate(values))
         same = spread[2] * wo[2] > 0
         near.append(tuple(jnp.sum(jnp.where(same, value, 0.0), -1) for value in values))
         far.append(tuple(jnp.sum(jnp.where(same, 0.0, value), -1) for value in values))
@@ -214,7 +222,7 @@ def flux(second: SecondLobe, wi: Vector, nodes: int, opaque: bool) -> list[tuple
         solid_angle = jnp.concatenate([solid_angle for _, solid_angle in rule], axis=-1)
         share = jnp.ones_like(solid_angle)  # a Henyey-Greenstein lobe is followed whole
         if isinstance(phase, BlurredSGGX):
-            share, rest = _peaked(phase, spread, peaked), 1.0 - _peaked(phase, spread, wo)
+            share, rest = _peak_share(phase, spread, peaked), 1.0 - _peak_share(phase, spread, wo)
             terms.append(tuple(rest * value for value in lobe))
         there = _lobes(second, spread, peaked, "all", opaque)[k]
         parts.append((peaked, tuple(v * share * jnp.abs(peaked[2]) * solid_angle for v in there)))
@@ -222,7 +230,7 @@ def flux(second: SecondLobe, wi: Vector, nodes: int, opaque: bool) -> list[tuple
     return [*parts, (wo, tuple(value * weight for value in even))]
 
 
-def _peaked(phase: BlurredSGGX, wi: Vector, wo: Vector) -> Array:
+def _peak_share(phase: BlurredSGGX, wi: Vector, wo: Vector) -> Array:
     """Share of the kernel that nodes which follow its peak account for."""
     sharp = phase.sharp(wi, wo)
     return sharp / (sharp + 1.0 / jnp.pi)
@@ -247,7 +255,7 @@ def _channels(second: SecondLobe) -> int:
     return second.weights.levels.shape[0]
 
 
-def _of_side(weights: Array, wi: Vector, wo: Vector, side: Side, opaque: bool) -> Array:
+def _side_weight(weights: Array, wi: Vector, wo: Vector, side: Side, opaque: bool) -> Array:
     """The weight that holds for the pair."""
     if opaque or side == "reflection":
         return weights[ABOVE]

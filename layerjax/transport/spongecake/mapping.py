@@ -25,7 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from layerjax._numerics import at_least, safe_sqrt
+from layerjax._numerics import clamp_min, safe_sqrt
 
 WIDTH, DEPTH = 128, 3
 """Hidden layers: how wide, how many (Sec. 5)."""
@@ -61,7 +61,7 @@ class Numbers(NamedTuple):
     axis: Array
 
 
-class Shape(NamedTuple):
+class LobeShape(NamedTuple):
     """Parameters of the second lobe of k media, (k,) each; alpha is g of a Henyey-Greenstein medium."""
 
     alpha: Array
@@ -116,21 +116,21 @@ def unpack(table: Mapping[str, np.ndarray], prefix: str, fresh: Callable[[Array]
     return eqx.tree_at(lambda net: [getattr(net.layers[n], name) for n, name in places], empty, numbers)
 
 
-def shape_of(net: eqx.nn.MLP, media: Numbers) -> Shape:
+def shape_of(net: eqx.nn.MLP, media: Numbers) -> LobeShape:
     """The second lobe's parameters, from `media` with the mean albedo and f0 of all channels."""
     count = len(media.thickness)
     found = []
     for order in orders(count):
-        turned = in_order(media, order)
-        raw = _answer(net, turned, turned.albedo, turned.f0)[: 3 * count].reshape(count, 3)
+        turned = reorder(media, order)
+        raw = _network_output(net, turned, turned.albedo, turned.f0)[: 3 * count].reshape(count, 3)
         found.append(raw[jnp.asarray(order)])  # an order of two is its own inverse
     raw = sum(found[1:], found[0]) / len(found)
     is_hg = media.kind[:, 2] > 0
-    width = at_least(media.alpha, LEAST_ALPHA)
+    width = clamp_min(media.alpha, LEAST_ALPHA)
     alpha = 0.02 + 0.98 * jax.nn.sigmoid(jax.scipy.special.logit(0.98 * width) + raw[:, 0])
     g = 0.98 * jnp.tanh(jnp.arctanh(0.99 * media.g) + raw[:, 0])
     thickness = media.thickness / (1.0 + 0.1 * media.thickness) * jnp.exp(raw[:, 1])
-    return Shape(jnp.where(is_hg, g, alpha), thickness, jnp.exp(2.0 * raw[:, 2] - 2.0))
+    return LobeShape(jnp.where(is_hg, g, alpha), thickness, jnp.exp(2.0 * raw[:, 2] - 2.0))
 
 
 def weights_of(net: eqx.nn.MLP, media: Numbers, mean_albedo: Array, mean_f0: Array) -> Weights:
@@ -139,7 +139,7 @@ def weights_of(net: eqx.nn.MLP, media: Numbers, mean_albedo: Array, mean_f0: Arr
     lobes, levels, slopes, rims = [], [], [], []
     for order in orders(count):
         index = jnp.asarray(order)
-        raw = _answer(net, in_order(media, order), mean_albedo[index], mean_f0[index])[3 * count :]
+        raw = _network_output(net, reorder(media, order), mean_albedo[index], mean_f0[index])[3 * count :]
         strength = jax.nn.softplus(raw.reshape(2, 2 * count + 3))
         lobes.append(strength[:, : 2 * count].reshape(2, count, 2)[:, index])
         levels.append(strength[:, 2 * count])
@@ -156,7 +156,7 @@ def weights_of(net: eqx.nn.MLP, media: Numbers, mean_albedo: Array, mean_f0: Arr
     )
 
 
-def _answer(net: eqx.nn.MLP, media: Numbers, mean_albedo: Array, mean_f0: Array) -> Array:
+def _network_output(net: eqx.nn.MLP, media: Numbers, mean_albedo: Array, mean_f0: Array) -> Array:
     count = len(media.thickness)
     features = []
     for k in range(count):
@@ -167,7 +167,7 @@ def _answer(net: eqx.nn.MLP, media: Numbers, mean_albedo: Array, mean_f0: Array)
 
 def geometry(medium: Numbers) -> Array:
     """Inputs of networks that describe a medium but for its absorption, (GEOMETRY_FEATURES,)."""
-    alpha = at_least(medium.alpha, LEAST_ALPHA)
+    alpha = clamp_min(medium.alpha, LEAST_ALPHA)
     is_hg = medium.kind[2]
     tilt = (1.0 - is_hg) * medium.axis[2] * medium.axis[2]
     radial, axial = (1.0 + medium.kind[k] * (alpha - 1.0) for k in (0, 1))
@@ -209,7 +209,7 @@ def orders(count: int) -> tuple[tuple[int, ...], ...]:
     return ((0,),) if count == 1 else ((0, 1), (1, 0))
 
 
-def in_order(media: Numbers, order: tuple[int, ...]) -> Numbers:
+def reorder(media: Numbers, order: tuple[int, ...]) -> Numbers:
     return Numbers(*(part[jnp.asarray(order)] for part in media))
 
 

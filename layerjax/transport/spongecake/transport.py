@@ -15,10 +15,10 @@ from layerjax.directions import Vector
 from layerjax.stack import Interface, Stack, is_known, media_of
 from layerjax.tables import load
 from layerjax.transport.contract import TEXELS, DeterministicTransport, Side
-from layerjax.transport.known_directions import Known
+from layerjax.transport.known_directions import DirectionLookup
 from layerjax.transport.single_scattering import Media, SingleScattering, choices, density, draw
-from layerjax.transport.spongecake.bending import bend_network
-from layerjax.transport.spongecake.layers import MOST, pair_of
+from layerjax.transport.spongecake.energy_correction import correction_network
+from layerjax.transport.spongecake.layers import MOST_MEDIA, pair_of
 from layerjax.transport.spongecake.lobes import (
     Hemisphere,
     SecondLobe,
@@ -36,7 +36,7 @@ SECOND_SHARE = 1.0 / 3.0
 """How often what is drawn comes from the second lobe or the constant, where `proposal` has both."""
 
 
-class Mapped(eqx.Module):
+class SpongeCakeState(eqx.Module):
     """A stack, and its second lobe, None where nothing scatters."""
 
     first: Media
@@ -68,7 +68,7 @@ class SpongeCake(DeterministicTransport):
             and the constant.
     """
 
-    side_by_side: ClassVar[int] = TEXELS
+    texel_batch: ClassVar[int] = TEXELS
 
     proposal: Proposal = eqx.field(static=True, default="first")
 
@@ -90,44 +90,44 @@ class SpongeCake(DeterministicTransport):
                     "only); SingleScattering, AddingDoubling and RandomWalk carry it"
                 )
         media = tuple(media_of(stack))
-        if len(media) > MOST and (is_traced(media) or map_shape(stack)):
+        if len(media) > MOST_MEDIA and (is_traced(media) or map_shape(stack)):
             raise ValueError(
-                f"layers: SpongeCake puts {len(media)} media together to {MOST} by their numbers, which are traced "
-                "here, or differ from texel to texel; prepare the stack outside jit, grad and vmap, or take "
+                f"layers: SpongeCake puts {len(media)} media together to {MOST_MEDIA} by their numbers, which are "
+                "traced here, or differ from texel to texel; prepare the stack outside jit, grad and vmap, or take "
                 "SingleScattering or AddingDoubling"
             )
 
-    def prepare(self, stack: Stack) -> Mapped:
+    def prepare(self, stack: Stack) -> SpongeCakeState:
         first = SingleScattering().prepare(stack)
         scatters = any(not is_known(medium.albedo, 0.0) for medium in first.media)
-        second = _second(pair_of(first.media), networks(), bends()) if scatters else None
-        return Mapped(first, second, first.base is not None)
+        second = _second(pair_of(first.media), networks(), correction_networks()) if scatters else None
+        return SpongeCakeState(first, second, first.base is not None)
 
-    def for_tracing(self, stack: Stack, known: Known) -> "SpongeCake | None":
+    def traceable_equivalent(self, stack: Stack, known: DirectionLookup) -> "SpongeCake | None":
         """Itself, but of more media than can be traced."""
-        return self if len(media_of(stack)) <= MOST else None
+        return self if len(media_of(stack)) <= MOST_MEDIA else None
 
-    def evaluate(self, state: Mapped, wi: Vector, wo: Vector, side: Side) -> Channels:
+    def evaluate(self, state: SpongeCakeState, wi: Vector, wo: Vector, side: Side) -> Channels:
         values = SingleScattering().evaluate(state.first, wi, wo, side)
         if state.second is None or (state.opaque and side == "transmission"):
             return values
         # the three lobes of Sec. 5
         return total([values, evaluate_second(state.second, wi, wo, side, state.opaque)])
 
-    def sample(self, state: Mapped, wi: Vector, uniforms: tuple[Array, Array, Array]) -> Vector:
+    def sample(self, state: SpongeCakeState, wi: Vector, uniforms: tuple[Array, Array, Array]) -> Vector:
         return draw(self._choices(state, wi), wi, uniforms)
 
-    def pdf(self, state: Mapped, wi: Vector, wo: Vector) -> Array:
+    def pdf(self, state: SpongeCakeState, wi: Vector, wo: Vector) -> Array:
         return density(self._choices(state, wi), wi, wo)
 
-    def albedo(self, state: Mapped, wi: Vector, nodes: int) -> tuple[Channels, Channels]:
+    def albedo(self, state: SpongeCakeState, wi: Vector, nodes: int) -> tuple[Channels, Channels]:
         first = SingleScattering().albedo(state.first, wi, nodes)
         if state.second is None:
             return first
         second = second_albedo(state.second, wi, nodes, state.opaque)
         return total([first[0], second[0]]), total([first[1], second[1]])
 
-    def _choices(self, state: Mapped, wi: Vector) -> list[tuple[Array, Any]]:
+    def _choices(self, state: SpongeCakeState, wi: Vector) -> list[tuple[Array, Any]]:
         """Lobes to draw from, with their probabilities."""
         first = choices(state.first, wi)
         if self.proposal == "first" or state.second is None:  # Sec. 4.6
@@ -145,14 +145,16 @@ class SpongeCake(DeterministicTransport):
 def networks() -> Mapping[int, eqx.nn.MLP]:
     """The trained networks that are shipped, by the number of media."""
     table = load("spongecake")
-    return {media: unpack(table, str(media), partial(network, media)) for media in range(1, MOST + 1)}
+    return {media: unpack(table, str(media), partial(network, media)) for media in range(1, MOST_MEDIA + 1)}
 
 
 @cache
-def bends() -> Mapping[int, eqx.nn.MLP]:
-    """The trained networks of `layerjax.transport.spongecake.bending` that are shipped, by the number of media."""
+def correction_networks() -> Mapping[int, eqx.nn.MLP]:
+    """The shipped networks of `layerjax.transport.spongecake.energy_correction`, by the number of media."""
     table = load("spongecake")
-    return {media: unpack(table, f"{media}-bend", partial(bend_network, media)) for media in range(1, MOST + 1)}
+    return {
+        media: unpack(table, f"{media}-bend", partial(correction_network, media)) for media in range(1, MOST_MEDIA + 1)
+    }
 
 
 _second = eqx.filter_jit(second_lobe)

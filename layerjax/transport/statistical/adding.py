@@ -15,8 +15,8 @@ import jax.numpy as jnp
 from jax import Array
 
 from layerjax import channels
-from layerjax._numerics import at_least, at_most
-from layerjax.channels import Channels, each
+from layerjax._numerics import clamp_max, clamp_min
+from layerjax.channels import Channels, map_channels
 
 Orders = tuple[Channels, ...]
 
@@ -51,7 +51,7 @@ class Element(NamedTuple):
     jacobian: Channels
 
 
-class Above(NamedTuple):
+class UpperStatistics(NamedTuple):
     """What is known of all elements so far, seen as one.
 
     t0: energy transmitted down, ri: reflected back down, ti: transmitted up; s...: their variances, that of t0 and ri
@@ -74,45 +74,45 @@ class Lobe(NamedTuple):
     variance: Channels
 
 
-def nothing(cosine: Array) -> Above:
+def identity(cosine: Array) -> UpperStatistics:
     """No element at all."""
     zero, one = (jnp.zeros_like(cosine),), (jnp.ones_like(cosine),)
-    return Above((one,), (zero,), (one,), zero, zero, zero, one)
+    return UpperStatistics((one,), (zero,), (one,), zero, zero, zero, one)
 
 
-def add_element(above: Above, element: Element) -> tuple[Lobe, Above]:
+def add_element(above: UpperStatistics, element: Element) -> tuple[Lobe, UpperStatistics]:
     """The lobe that the element sends out of the top, and what is above its lower side."""
-    between = times(above.ri, element.r12)
-    inverse = escapes(between)
-    m = times(above.t0, element.r12, above.ti, inverse)
+    between = multiply_orders(above.ri, element.r12)
+    inverse = geometric_series(between)
+    m = multiply_orders(above.t0, element.r12, above.ti, inverse)
     # mean number of further turns between the two, and the variance of them
-    rr = each(lambda turned: turned / at_least(1.0 - turned, LEAST_ESCAPE), whole(between))
-    turns = each(lambda rr, w, s: rr * (w + s), rr, element.widening, above.s_ri)
-    variance = each(  # Eq. (36)
-        lambda s_ti, j, s_t0, w, turns: at_most(s_ti + j * (s_t0 + w + turns), MOST_VARIANCE),
+    rr = map_channels(lambda turned: turned / clamp_min(1.0 - turned, LEAST_ESCAPE), sum_orders(between))
+    turns = map_channels(lambda rr, w, s: rr * (w + s), rr, element.widening, above.s_ri)
+    variance = map_channels(  # Eq. (36)
+        lambda s_ti, j, s_t0, w, turns: clamp_max(s_ti + j * (s_t0 + w + turns), MOST_VARIANCE),
         above.s_ti, above.jacobian, above.s_t0, element.widening, turns,
     )  # fmt: skip
-    s_t0 = each(  # Eqs. (47-49)
+    s_t0 = map_channels(  # Eqs. (47-49)
         lambda j, s, turns, d: (s + turns) / j + d, element.jacobian, above.s_t0, turns, element.down
     )
-    s_ti = each(  # Eq. (50)
-        lambda j, up, turns, s: at_most(j * (up + turns) + s, MOST_VARIANCE),
+    s_ti = map_channels(  # Eq. (50)
+        lambda j, up, turns, s: clamp_max(j * (up + turns) + s, MOST_VARIANCE),
         above.jacobian, element.up, turns, above.s_ti,
     )  # fmt: skip
-    back = times(element.t21, above.ri, element.t12, inverse)
-    through = each(
+    back = multiply_orders(element.t21, above.ri, element.t12, inverse)
+    through = map_channels(
         lambda d, j, up, s, turns: d + (up + s + turns) / j,
         element.down, element.jacobian, element.up, above.s_ri, turns,
     )  # fmt: skip
-    s_ri = each(_mean_variance, whole(element.r21), whole(back), element.widening, through)
-    return Lobe(m, variance), Above(
-        t0=times(above.t0, element.t12, inverse),  # Eq. (31)
-        ri=plus(element.r21, back),  # Eq. (30)
-        ti=times(element.t21, above.ti, inverse),  # Eq. (29)
+    s_ri = map_channels(_mean_variance, sum_orders(element.r21), sum_orders(back), element.widening, through)
+    return Lobe(m, variance), UpperStatistics(
+        t0=multiply_orders(above.t0, element.t12, inverse),  # Eq. (31)
+        ri=add_orders(element.r21, back),  # Eq. (30)
+        ti=multiply_orders(element.t21, above.ti, inverse),  # Eq. (29)
         s_t0=s_t0,
         s_ri=s_ri,
         s_ti=s_ti,
-        jacobian=each(lambda j, factor: at_most(j * factor, MOST_JACOBIAN), above.jacobian, element.jacobian),
+        jacobian=map_channels(lambda j, factor: clamp_max(j * factor, MOST_JACOBIAN), above.jacobian, element.jacobian),
     )
 
 
@@ -124,49 +124,53 @@ def _mean_variance(reflected: Array, crossed: Array, widening: Array, through: A
     return widening + share * (through - widening)
 
 
-def retain(above: Above, share: Channels) -> Above:
+def limit_escape(above: UpperStatistics, share: Channels) -> UpperStatistics:
     """Only this share (kappa, Eqs. 34-35) of the light from below gets out; the rest is totally reflected."""
-    kept = tuple(each(lambda energy, share: (1.0 - share) * energy, energy, share) for energy in above.ti)
-    return above._replace(ri=plus(above.ri, kept), ti=tuple(channels.times(share, energy) for energy in above.ti))
+    kept = tuple(map_channels(lambda energy, share: (1.0 - share) * energy, energy, share) for energy in above.ti)
+    return above._replace(
+        ri=add_orders(above.ri, kept), ti=tuple(channels.multiply(share, energy) for energy in above.ti)
+    )
 
 
-def whole(energy: Orders) -> Channels:
+def sum_orders(energy: Orders) -> Channels:
     """The statistics of all orders together."""
     return channels.total(energy)
 
 
-def plus(a: Orders, b: Orders) -> Orders:
+def add_orders(a: Orders, b: Orders) -> Orders:
     """Sum of energies by scattering orders; what has no more than one entry has not been scattered."""
     longer, shorter = (a, b) if len(a) >= len(b) else (b, a)
     return (*(channels.total(pair) for pair in zip(longer, shorter, strict=False)), *longer[len(shorter) :])
 
 
-def times(*factors: Orders) -> Orders:
+def multiply_orders(*factors: Orders) -> Orders:
     """Product of energies by scattering orders; the last entry takes all orders beyond it, so that sums multiply."""
     return reduce(_product, factors)
 
 
 def _product(a: Orders, b: Orders) -> Orders:
     if len(a) == 1 or len(b) == 1:
-        return tuple(channels.times(x, y) for x in a for y in b)
+        return tuple(channels.multiply(x, y) for x in a for y in b)
     last = len(a) - 1
     sums: list[list[Channels]] = [[] for _ in a]
     for i, x in enumerate(a):
         for j, y in enumerate(b):
-            sums[min(i + j, last)].append(channels.times(x, y))
+            sums[min(i + j, last)].append(channels.multiply(x, y))
     return tuple(channels.total(parts) for parts in sums)
 
 
-def escapes(x: Orders) -> Orders:
+def geometric_series(x: Orders) -> Orders:
     """1 + x + x^2 + ... by scattering orders."""
-    first = each(lambda x: 1.0 / at_least(1.0 - x, LEAST_ESCAPE), x[0])
+    first = map_channels(lambda x: 1.0 / clamp_min(1.0 - x, LEAST_ESCAPE), x[0])
     if len(x) == 1:
         return (first,)
     found = [first]
     for k in range(1, len(x) - 1):
-        again = channels.total([channels.times(x[j], found[k - j]) for j in range(1, k + 1)])
-        found.append(channels.times(first, again))
-    rest = each(
-        lambda x, known: at_least(1.0 / at_least(1.0 - x, LEAST_ESCAPE) - known, 0.0), whole(x), channels.total(found)
+        again = channels.total([channels.multiply(x[j], found[k - j]) for j in range(1, k + 1)])
+        found.append(channels.multiply(first, again))
+    rest = map_channels(
+        lambda x, known: clamp_min(1.0 / clamp_min(1.0 - x, LEAST_ESCAPE) - known, 0.0),
+        sum_orders(x),
+        channels.total(found),
     )
     return (*found, rest)

@@ -11,8 +11,8 @@ import jax.numpy as jnp
 from jax import Array
 
 from layerjax._numerics import horizon
-from layerjax.channels import Channels, each, per_channel, select, times, total
-from layerjax.directions import Vector, sanitised
+from layerjax.channels import Channels, map_channels, multiply, per_channel, select, total
+from layerjax.directions import Vector, sanitise
 from layerjax.microsurface.energy_tables import interface_energies
 from layerjax.stack import Interface, Medium, Stack, is_known
 from layerjax.surfaces import Lambertian
@@ -40,19 +40,19 @@ class CoatedBase(eqx.Module):
         """BRDF of the light that has reached the base, 0 unless both directions are above."""
         edge = horizon(wi[2].dtype)
         valid = (wi[2] > edge) & (wo[2] > edge)
-        there, back = (self.arriving(sanitised(w, valid)[2]) for w in (wi, wo))
+        there, back = (self.transmittance(sanitise(w, valid)[2]) for w in (wi, wo))
         returned = tuple(reflection(load("diffuse_interface"), self.alpha, self.ior, t) for t in _taus(self))
         one = jnp.ones_like(wi[2])
-        level = each(lambda r, rho: closed_form(one, one, r, rho, self.ior), returned, self.reflectance)
-        return select(valid, times(there, back, level))
+        level = map_channels(lambda r, rho: closed_form(one, one, r, rho, self.ior), returned, self.reflectance)
+        return select(valid, multiply(there, back, level))
 
     def albedo(self, wi: Vector) -> Channels:
         """Energy of `value` for light along wi, above."""
         means = [coat_means(self.alpha, self.ior, t) for t in _taus(self)]
         leaving, returned = tuple(mean.leaving for mean in means), tuple(mean.returned for mean in means)
-        return each(indirect_energy, self.arriving(wi[2]), leaving, returned, self.reflectance)
+        return map_channels(indirect_energy, self.transmittance(wi[2]), leaving, returned, self.reflectance)
 
-    def arriving(self, cosine: Array) -> Channels:
+    def transmittance(self, cosine: Array) -> Channels:
         """Share of light along a cosine that arrives at the base."""
         if self.tau is None:
             return (interface_energies(cosine, self.alpha, self.ior, multiple=True)[1],)

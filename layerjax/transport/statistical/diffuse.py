@@ -25,7 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from layerjax._numerics import at_least, at_most, safe_sqrt
+from layerjax._numerics import clamp_max, clamp_min, safe_sqrt
 from layerjax.directions import Vector
 from layerjax.microsurface.energy_tables import index_variable
 from layerjax.microsurface.splines import taps, weights
@@ -92,14 +92,14 @@ def coat_means(alpha: Array, ior: Array, tau: Array) -> Means:
     parts, side = _transmission_parts(table, cosine, alpha, ior)
     weight = 2.0 * weight * cosine / (ior * ior)  # by reciprocity
     one = jnp.ones_like(tau)
-    clear, entering = (at_least(_absorbed(table, "absorption", parts, side, t), 0.0) for t in (one, tau))
+    clear, entering = (clamp_min(_sum_absorption(table, "absorption", parts, side, t), 0.0) for t in (one, tau))
     out_clear, out = jnp.sum(weight * clear, axis=0), jnp.sum(weight * entering, axis=0)
     moment = jnp.sum(weight * entering * 0.5 * (1.0 - cosine) * (1.0 + cosine), axis=0)
-    narrow = 0.25 * at_most(ior * ior, 1.0)  # even on the part of the disc where light can leave
-    back, back_clear = (at_least(reflection(table, alpha, ior, t), 0.0) for t in (tau, one))
+    narrow = 0.25 * clamp_max(ior * ior, 1.0)  # even on the part of the disc where light can leave
+    back, back_clear = (clamp_min(reflection(table, alpha, ior, t), 0.0) for t in (tau, one))
     # without absorption all that does not leave returns: the smaller of the two is the more exact, and decides
-    all_clear = jnp.where(ior < 1.0, 1.0 - back_clear, at_most(out_clear, 1.0))
-    absorbed = at_most((back + LEAST_ENERGY * tau) / (back_clear + LEAST_ENERGY), 1.0)
+    all_clear = jnp.where(ior < 1.0, 1.0 - back_clear, clamp_max(out_clear, 1.0))
+    absorbed = clamp_max((back + LEAST_ENERGY * tau) / (back_clear + LEAST_ENERGY), 1.0)
     return Means(
         leaving=out * all_clear / out_clear,
         returned=(1.0 - all_clear) * absorbed,
@@ -160,7 +160,7 @@ def stack_lobe(coats: Sequence[Coat], albedo: Array, cosine: Array) -> tuple[Arr
     indices = [jnp.asarray(1.0), *(coat.ior for coat in coats)]
     relative = [below / above for above, below in pairwise(indices)]
     means = [coat_means(coat.alpha, n, coat.tau) for coat, n in zip(coats, relative, strict=True)]
-    energy, below, sigma = _arriving(coats, relative, cosine), albedo, jnp.asarray(0.0)
+    energy, below, sigma = _arrival_share(coats, relative, cosine), albedo, jnp.asarray(0.0)
     for i in reversed(range(len(coats))):
         alpha, n, mean = coats[i].alpha, relative[i], means[i]
         again = 1.0 / (1.0 - mean.returned * below)
@@ -171,13 +171,13 @@ def stack_lobe(coats: Sequence[Coat], albedo: Array, cosine: Array) -> tuple[Arr
             energy = energy * mean.leaving * again  # Eq. (12)
             through = variance(transmission_scale(jnp.ones_like(n), 1.0 / n, jnp.ones_like(n)) * alpha)
             bounces = (again - 1.0) * (variance(alpha) + variance(coats[i + 1].alpha))
-            sigma = at_most(n * (sigma + bounces) + through, widest)  # Eq. (13), and the bound below it
+            sigma = clamp_max(n * (sigma + bounces) + through, widest)  # Eq. (13), and the bound below it
         # of diffuse light from above: reflected by the interface, and by all below it
         below = 1.0 - n * n * (mean.clear - mean.leaving * mean.leaving * below * again)
     return energy, roughness(sigma)
 
 
-def _arriving(coats: Sequence[Coat], relative: Sequence[Array], cosine: Array) -> Array:
+def _arrival_share(coats: Sequence[Coat], relative: Sequence[Array], cosine: Array) -> Array:
     """Share of light at this cosine that arrives at the base for the first time."""
     energy, back = jnp.ones_like(cosine), jnp.zeros_like(cosine)
     for coat, n in zip(coats, relative, strict=True):
@@ -210,7 +210,7 @@ def width(moment: Array) -> Array:
     """GGX width of the lobe, lit along the normal, with this second moment on the disc: inverse of `normal_lobe`."""
     table = load("diffuse_interface")
     first, last = (float(x) for x in table["moments"])
-    place = (jnp.log(at_most(at_least(moment, first), last)) - math.log(first)) / math.log(last / first)
+    place = (jnp.log(clamp_max(clamp_min(moment, first), last)) - math.log(first)) / math.log(last / first)
     index, weights = spline(place, table["widths"].shape[0])
     return jnp.exp(jnp.sum(_pick(table["widths"], weights.dtype, index) * weights, axis=-1))
 
@@ -218,7 +218,7 @@ def width(moment: Array) -> Array:
 def transmission(table: Table, cosine: Array, alpha: Array, ior: Array, tau: Array) -> Array:
     """T01 from a table (Eq. 8)."""
     parts, side = _transmission_parts(table, cosine, alpha, ior)
-    return at_least(_absorbed(table, "absorption", parts, side, tau), 0.0)
+    return clamp_min(_sum_absorption(table, "absorption", parts, side, tau), 0.0)
 
 
 def reflection(table: Table, alpha: Array, ior: Array, tau: Array) -> Array:
@@ -230,7 +230,7 @@ def reflection(table: Table, alpha: Array, ior: Array, tau: Array) -> Array:
     j, across = spline(jnp.broadcast_to(index_variable(ior), shape), indices)
     plane = _pick(table["returned"], along.dtype, side[..., None, None], i[..., :, None], j[..., None, :])
     parts = jnp.sum((along[..., :, None] * across[..., None, :])[..., None] * plane, axis=(-3, -2))
-    return _absorbed(table, "returned_absorption", parts, side, tau)
+    return _sum_absorption(table, "returned_absorption", parts, side, tau)
 
 
 def cosine_variable(cosine: Array, ior: Array) -> Array:
@@ -275,7 +275,7 @@ def _pick(values: np.ndarray, dtype: jnp.dtype, *index: Array) -> Array:
     return jnp.asarray(values, dtype)[index]
 
 
-def _absorbed(table: Table, name: str, parts: Array, side: Array, tau: Array) -> Array:
+def _sum_absorption(table: Table, name: str, parts: Array, side: Array, tau: Array) -> Array:
     """Sum over the basis in tau of its functions times their parts (..., functions)."""
     powers = _powers(jnp.asarray(tau)[..., None], 1.0 / jnp.asarray(table["cosines"], parts.dtype))
     basis = jnp.asarray(table[name], parts.dtype)  # (side, function, power)

@@ -23,18 +23,18 @@ import numpy as np
 from jax import Array
 
 from layerjax._devices import exact_products
-from layerjax._numerics import at_least, at_most, horizon, safe_div, safe_sqrt
-from layerjax.channels import Channels, per_channel, pick, select, times
-from layerjax.directions import Vector, sanitised
+from layerjax._numerics import clamp_max, clamp_min, horizon, safe_div, safe_sqrt
+from layerjax.channels import Channels, multiply, per_channel, pick, select
+from layerjax.directions import Vector, sanitise
 from layerjax.quadrature import gauss_legendre
 from layerjax.stack import Interface, Stack, media_of, optical_depths
 from layerjax.surfaces import Lambertian, Surface
-from layerjax.transport.adding_doubling.facet_light import Normals, facet_energies
-from layerjax.transport.adding_doubling.grid import Grid, Region, at_table_points, interpolated, table_region
+from layerjax.transport.adding_doubling.facet_scattering import Normals, facet_energies
+from layerjax.transport.adding_doubling.grid import Grid, Region, interpolate_rows, table_region, table_values
 from layerjax.transport.adding_doubling.operators import Parts
 from layerjax.transport.adding_doubling.resolution import Resolution
 from layerjax.transport.adding_doubling.solve import Plan, make_plan, solve
-from layerjax.transport.first_order import colliding_share
+from layerjax.transport.first_order import collision_probability
 from layerjax.transport.statistical.diffuse import closed_form, indirect_energy
 from layerjax.transport.statistical.lobes import precision
 
@@ -60,7 +60,7 @@ class DiffuseBase(eqx.Module):
     """
 
     grid: Grid
-    arriving: Array
+    transmittance: Array
     level: Array
     energy: Array
 
@@ -68,12 +68,12 @@ class DiffuseBase(eqx.Module):
         """BRDF of the light that has reached the base, 0 unless both directions are above."""
         edge = horizon(wi[2].dtype)
         valid = (wi[2] > edge) & (wo[2] > edge)
-        incoming, back = (_arriving(self, sanitised(w, valid)) for w in (wi, wo))
-        return select(valid, times(incoming, back, per_channel(self.level)))
+        incoming, back = (_transmittance(self, sanitise(w, valid)) for w in (wi, wo))
+        return select(valid, multiply(incoming, back, per_channel(self.level)))
 
     def albedo(self, wi: Vector) -> Channels:
         """Energy of `value` for light along wi, above."""
-        incoming, factor = _arriving(self, wi), per_channel(self.energy)
+        incoming, factor = _transmittance(self, wi), per_channel(self.energy)
         return tuple(pick(incoming, c) * pick(factor, c) for c in range(max(len(incoming), len(factor))))
 
 
@@ -114,7 +114,7 @@ def _closed_form(bare: Stack, base: Surface, plan: Plan, dtype: Any) -> DiffuseB
     inward, outward = (2.0 * region.weight / region.ior**2 for region in (bottom, top))
     returned = jnp.sum(inward * counted * back, axis=-1)
     if not isinstance(base, Lambertian):
-        returned = at_most(returned, LARGEST_RETURN / at_least(albedo, 1.0))
+        returned = clamp_max(returned, LARGEST_RETURN / clamp_min(albedo, 1.0))
     leaving = jnp.sum(outward * incoming, axis=-1) / bottom.ior**2  # by reciprocity
     one = jnp.ones_like(returned)
     level = closed_form(one, one, returned, albedo, bottom.ior)
@@ -138,7 +138,7 @@ def _refracted_table(bare: Stack, grid: Grid, incoming: Array, plan: Plan) -> Ar
     at_nodes, at_points = entering(top), entering(table_region(grid, top))
     typical = safe_div(incoming @ top.weight, at_nodes @ top.weight)[:, None]
     behind = (incoming + LEAST_ENTERING * typical) / (at_nodes + LEAST_ENTERING)
-    return at_table_points(grid, behind) * at_points
+    return table_values(grid, behind) * at_points
 
 
 def _ballistic_table(bare: Stack, base: Surface, grid: Grid, scattered: Array) -> Array:
@@ -150,11 +150,11 @@ def _ballistic_table(bare: Stack, base: Surface, grid: Grid, scattered: Array) -
         return region.sine, jnp.zeros_like(region.sine), region.cosine
 
     points = table_region(grid, top)
-    at_nodes, at_points = (jnp.stack(colliding_share(media, along(region))) for region in (top, points))
+    at_nodes, at_points = (jnp.stack(collision_probability(media, along(region))) for region in (top, points))
     depths = [jnp.stack(depth) for depth in optical_depths(media, along(points))]
     ballistic = jnp.exp(-sum(depths[1:], depths[0])) * _share(base, points.cosine)
     scattered, at_nodes = _broadcast_pair(scattered, at_nodes)
-    return at_table_points(grid, scattered / at_nodes) * at_points + ballistic
+    return table_values(grid, scattered / at_nodes) * at_points + ballistic
 
 
 def _broadcast_pair(a: Array, b: Array) -> tuple[Array, Array]:
@@ -163,9 +163,9 @@ def _broadcast_pair(a: Array, b: Array) -> tuple[Array, Array]:
     return jnp.broadcast_to(a, (channels, *a.shape[1:])), jnp.broadcast_to(b, (channels, *b.shape[1:]))
 
 
-def _arriving(part: DiffuseBase, w: Vector) -> Channels:
-    rows = interpolated(part.grid, part.arriving, part.grid.regions[0].ior, w[2], w[0] * w[0] + w[1] * w[1])
-    return tuple(at_least(rows[..., c], 0.0) for c in range(rows.shape[-1]))
+def _transmittance(part: DiffuseBase, w: Vector) -> Channels:
+    rows = interpolate_rows(part.grid, part.transmittance, part.grid.regions[0].ior, w[2], w[0] * w[0] + w[1] * w[1])
+    return tuple(clamp_min(rows[..., c], 0.0) for c in range(rows.shape[-1]))
 
 
 def _share(base: Surface, cosine: Array) -> Array:
@@ -173,7 +173,7 @@ def _share(base: Surface, cosine: Array) -> Array:
     if isinstance(base, Lambertian):
         return jnp.ones_like(cosine)[None]
     diffuse: Any = base
-    base = eqx.tree_at(lambda surface: surface.albedo, diffuse, at_least(jnp.asarray(diffuse.albedo), LEAST_ALBEDO))
+    base = eqx.tree_at(lambda surface: surface.albedo, diffuse, clamp_min(jnp.asarray(diffuse.albedo), LEAST_ALBEDO))
     x, w = (jnp.asarray(array, cosine.dtype) for array in gauss_legendre(NODES))
     mean = jnp.sum(2.0 * w * x * _directional_albedo(base, x), axis=-1)
     return _directional_albedo(base, cosine) / mean[:, None]

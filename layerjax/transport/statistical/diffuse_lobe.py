@@ -12,15 +12,15 @@ import numpy as np
 from jax import Array
 
 from layerjax._devices import exact_products
-from layerjax._numerics import at_least, horizon, safe_sqrt
+from layerjax._numerics import clamp_min, horizon, safe_sqrt
 from layerjax.channels import Channels, per_channel, pick
-from layerjax.directions import Vector, sanitised
+from layerjax.directions import Vector, sanitise
 from layerjax.stack import Interface, Medium, Stack, is_known
 from layerjax.surfaces import Lambertian
 from layerjax.transport.adding_doubling.interpolate import cubic
 from layerjax.transport.statistical.diffuse import Coat, indirect_lobe, stack_lobe
 from layerjax.transport.statistical.lobes import precision
-from layerjax.transport.statistical.shaped import GRAZING
+from layerjax.transport.statistical.microfacet_lobes import GRAZING
 
 POINTS = 97
 """Cosines of a table, uniform in the angle above the horizon."""
@@ -36,7 +36,7 @@ class DiffuseLobe(eqx.Module):
         """BRDF of the lobe, 0 unless both directions are above."""
         edge = horizon(wi[2].dtype)
         valid = (wi[2] > edge) & (wo[2] > edge)
-        energies, seen = self.albedo(sanitised(wi, valid)), sanitised(wo, valid)
+        energies, seen = self.albedo(sanitise(wi, valid)), sanitise(wo, valid)
         return tuple(
             jnp.where(valid, indirect_lobe(seen, alpha, energy), 0.0)
             for alpha, energy in zip(self.alpha, energies, strict=True)
@@ -48,7 +48,7 @@ class DiffuseLobe(eqx.Module):
         first = jnp.clip(jnp.floor(place) - 1.0, 0.0, POINTS - 4.0).astype(jnp.int32)
         taps = [weight[..., None] * self.energy[first + j] for j, weight in enumerate(cubic(place - first))]
         rows = sum(taps[1:], taps[0])
-        return tuple(at_least(rows[..., c], 0.0) for c in range(rows.shape[-1]))  # a cubic may fall below its points
+        return tuple(clamp_min(rows[..., c], 0.0) for c in range(rows.shape[-1]))  # a cubic may fall below its points
 
 
 def why_no_lobe(stack: Stack, names: Sequence[str]) -> str | None:

@@ -9,8 +9,8 @@ these it is a polynomial of the cosine times the share that meets anything, whic
 import jax.numpy as jnp
 from jax import Array
 
-from layerjax._numerics import at_least, exprel
-from layerjax.channels import Channels, each, per_channel, times
+from layerjax._numerics import clamp_min, exprel
+from layerjax.channels import Channels, map_channels, multiply, per_channel
 from layerjax.stack import Interface, Medium, Stack
 from layerjax.surfaces import Lambertian
 from layerjax.transport.statistical import stream_layers, streams
@@ -30,16 +30,16 @@ class HazyBase(ClosedForm):
     scattered: Channels | None
     inner: StreamedBase | CoatedBase | None
 
-    def arriving(self, cosine: Array) -> Channels:
+    def transmittance(self, cosine: Array) -> Channels:
         """Share of light along a cosine that arrives at the base."""
         ballistic: Channels = tuple(jnp.exp(-depth / cosine) for depth in self.depth)
-        there = ballistic if self.inner is None else times(ballistic, self.inner.arriving(cosine))
+        there = ballistic if self.inner is None else multiply(ballistic, self.inner.transmittance(cosine))
         if self.scattered is None:
             return there
         found = streams.polynomials(cosine)
         share = tuple(exprel(depth / cosine) / cosine for depth in self.depth)
-        met = each(lambda s, row: s * at_least(streams.along(found, row), 0.0), share, self.scattered)
-        return each(jnp.add, there, met)
+        met = map_channels(lambda s, row: s * clamp_min(streams.arrival_share(found, row), 0.0), share, self.scattered)
+        return map_channels(jnp.add, there, met)
 
 
 def is_hazy(stack: Stack) -> bool:
@@ -55,24 +55,24 @@ def make_hazy(stack: Stack) -> HazyBase:
     top = [layer for layer in stack.layers[:first] if isinstance(layer, Medium)]
     under = Stack(stack.layers[first:], stack.base)
     index = jnp.ones((), dtype)
-    below = under_interfaces = stream_layers.base(dtype)
+    below = under_interfaces = stream_layers.black_base(dtype)
     inner: StreamedBase | CoatedBase | None = None
     if under.layers:
         inner = make_coated(under) if is_coated(under) else make_streamed(under)
-        below, index = stream_layers.under_layers(below, under.layers)
+        below, index = stream_layers.add_layers(below, under.layers)
         under_interfaces = below
     for medium in reversed(top):
-        below = stream_layers.under_medium(below, medium)
+        below = stream_layers.add_medium(below, medium)
     depth = sum(
         (stream_layers.collisions(medium, dtype) for medium in top[1:]), stream_layers.collisions(top[0], dtype)
     )
     scattered = None
     if not all(map(absorbs, top)):
-        met = below.onward - under_interfaces.onward * stream_layers.ballistic(depth)
+        met = below.arrival - under_interfaces.arrival * stream_layers.ballistic(depth)
         nodes = jnp.asarray(streams.NODES, dtype)
         share = exprel(depth[:, None] / nodes) / nodes
-        scattered = per_channel(streams.by_polynomials(met / share))
-    leaving = per_channel(streams.dot(below.onward, jnp.asarray(streams.DIFFUSE, dtype)) / index**2)  # by reciprocity
+        scattered = per_channel(streams.polynomial_coefficients(met / share))
+    leaving = per_channel(streams.dot(below.arrival, jnp.asarray(streams.DIFFUSE, dtype)) / index**2)  # by reciprocity
     albedo, returned, one = (
         per_channel(jnp.asarray(stack.base.albedo)),
         per_channel(below.returned),
@@ -82,6 +82,6 @@ def make_hazy(stack: Stack) -> HazyBase:
         depth=per_channel(depth),
         scattered=scattered,
         inner=inner,
-        level=each(lambda r, rho: closed_form(one, one, r, rho, index), returned, albedo),
-        energy=each(lambda out, r, rho: indirect_energy(one, out, r, rho), leaving, returned, albedo),
+        level=map_channels(lambda r, rho: closed_form(one, one, r, rho, index), returned, albedo),
+        energy=map_channels(lambda out, r, rho: indirect_energy(one, out, r, rho), leaving, returned, albedo),
     )

@@ -14,13 +14,13 @@ import numpy as np
 from jax import Array
 
 from layerjax import channels, fresnel
-from layerjax._numerics import at_least, at_most, unstacked
-from layerjax.channels import Channels, each, per_channel
+from layerjax._numerics import clamp_max, clamp_min, unstack
+from layerjax.channels import Channels, map_channels, per_channel
 from layerjax.microsurface.directional_albedo import is_smooth
-from layerjax.microsurface.energy_tables import conductor_energies, interface_energies, retained_share
+from layerjax.microsurface.energy_tables import conductor_energies, escape_cone_share, interface_energies
 from layerjax.stack import Interface, Medium, Stack, is_known
 from layerjax.surfaces import Conductor
-from layerjax.transport.statistical.adding import Element, Lobe, add_element, nothing, retain
+from layerjax.transport.statistical.adding import Element, Lobe, add_element, identity, limit_escape
 from layerjax.transport.statistical.variance import (
     bounded_refracted_cosine,
     phase_variance,
@@ -116,7 +116,7 @@ def parts(stack: Stack, upward: bool, smooth: tuple[bool, ...] | None = None) ->
 def statistics(stack: Stack, cosine: Array, options: Options, upward: bool = False) -> Statistics:
     """Lobes of a simplified stack, lit along cosines > 0, from below if `upward`. Diffuse bases are omitted."""
     met = parts(stack, upward, options.smooth)
-    above = nothing(cosine)
+    above = identity(cosine)
     reflected: list[Reflection] = []
     spread: Channels | None = None
     depth: Channels = (jnp.zeros_like(cosine),)
@@ -128,15 +128,15 @@ def statistics(stack: Stack, cosine: Array, options: Options, upward: bool = Fal
             element, scattered = _medium(what, here, options)
             if scattered is not None and options.scattering == "orders":
                 optical, width = scattered
-                mean = channels.times(above.jacobian, (width,))
-                spread = mean if spread is None else each(_mean_spread, depth, spread, optical, mean)
+                mean = channels.multiply(above.jacobian, (width,))
+                spread = mean if spread is None else map_channels(_mean_spread, depth, spread, optical, mean)
                 depth = channels.total([depth, optical])
             _, above = add_element(above, element)
             continue
         alpha = jnp.asarray(what.alpha)
         if over is not None:  # some of the light on its way up is totally reflected: Eqs. (32-35)
             width = jnp.stack([roughness(sigma + variance(alpha)) for sigma in above.s_t0])
-            above = retain(above, tuple(retained_share(here, width, over / index)))
+            above = limit_escape(above, tuple(escape_cone_share(here, width, over / index)))
         element = _conductor(what, here, index, options, smooth) if isinstance(what, Conductor) else next(interfaces)
         lobe, above = add_element(above, element)
         relative = index if isinstance(what, Conductor) else below / index
@@ -145,12 +145,12 @@ def statistics(stack: Stack, cosine: Array, options: Options, upward: bool = Fal
     if stack.base is not None:
         return Statistics(tuple(reflected), None, None)
     # what is transmitted is described behind the stack
-    behind = None if spread is None else each(jnp.divide, spread, above.jacobian)
+    behind = None if spread is None else map_channels(jnp.divide, spread, above.jacobian)
     return Statistics(tuple(reflected), Lobe(above.t0, above.s_t0), behind)
 
 
 def _mean_spread(depth: Array, spread: Array, optical: Array, mean: Array) -> Array:
-    return (depth * spread + optical * mean) / at_least(depth + optical, LEAST_DEPTH)
+    return (depth * spread + optical * mean) / clamp_min(depth + optical, LEAST_DEPTH)
 
 
 def _interfaces(met: Sequence[Part], cosines: Sequence[Array], options: Options) -> list[Element]:
@@ -174,7 +174,7 @@ def _interfaces(met: Sequence[Part], cosines: Sequence[Array], options: Options)
     widening = variance(alpha) * one
     down = variance(transmission_scale(steep_i, ior, steep_t) * alpha)
     up = variance(transmission_scale(steep_t, 1.0 / ior, steep_i) * alpha)
-    rows = zip(*map(unstacked, (r12, t12, r21, t21, widening, down, up, jacobian)), strict=True)
+    rows = zip(*map(unstack, (r12, t12, r21, t21, widening, down, up, jacobian)), strict=True)
     return [
         Element(
             r12=((above_r,),),
@@ -221,7 +221,7 @@ def metal_levels(base: Conductor, cosine: Array, index: Array, multiple: bool, s
     """Reflectance of a metal in a medium of this index."""
     ior, k = (tuple(x / index for x in per_channel(jnp.asarray(value))) for value in (base.ior, base.k))
     if smooth:
-        return each(lambda ior, k: fresnel.conductor(cosine, ior, k), ior, k)
+        return map_channels(lambda ior, k: fresnel.conductor(cosine, ior, k), ior, k)
     return conductor_energies(cosine, jnp.asarray(base.alpha), ior, k, multiple)
 
 
@@ -234,23 +234,23 @@ def _medium(medium: Medium, cosine: Array, options: Options) -> tuple[Element, t
     g = medium.phase.forward_lobe
     if g is None or is_known(medium.albedo, 0.0):
         return Element(dark, (ballistic,), dark, (ballistic,), zero, zero, zero, one), None
-    scattered = channels.times(per_channel(jnp.asarray(medium.albedo)), depth)
+    scattered = channels.multiply(per_channel(jnp.asarray(medium.albedo)), depth)
     width = phase_variance(jnp.asarray(g))
     if options.scattering == "single":
-        passed = each(lambda s, t: jnp.exp(jnp.log1p(s) - t), scattered, depth)  # (1 + t) exp(-t)
+        passed = map_channels(lambda s, t: jnp.exp(jnp.log1p(s) - t), scattered, depth)  # (1 + t) exp(-t)
         added = tuple(s / (1.0 + s) * width for s in scattered)
         return Element(dark, (passed,), dark, (passed,), zero, added, added, one), None
-    once = channels.times(ballistic, scattered)
-    more = each(lambda s, t, e, o: at_least(jnp.exp(s - t) - e - o, 0.0), scattered, depth, ballistic, once)
+    once = channels.multiply(ballistic, scattered)
+    more = map_channels(lambda s, t, e, o: clamp_min(jnp.exp(s - t) - e - o, 0.0), scattered, depth, ballistic, once)
     orders = (ballistic, once, more)
     return Element(dark, orders, dark, orders, zero, zero, zero, one), (scattered, width)
 
 
 def lobe_roughness(sigma: Array) -> Array:
     """GGX width of a lobe of this variance, within the range that lobes are evaluated in."""
-    return bounded(roughness(sigma))
+    return bound_alpha(roughness(sigma))
 
 
-def bounded(alpha: Array) -> Array:
+def bound_alpha(alpha: Array) -> Array:
     """A GGX width kept within the range that lobes are evaluated in."""
-    return at_most(at_least(alpha, 1e-4), 1.0)
+    return clamp_max(clamp_min(alpha, 1e-4), 1.0)

@@ -15,10 +15,20 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from layerjax._numerics import broadcasting
+from layerjax._numerics import allow_broadcasting
 from layerjax.channels import per_channel
 from layerjax.stack import Interface, Medium, is_known
-from layerjax.transport.statistical.streams import DIFFUSE, NODES, STREAMS, WEIGHTS, Face, dot, face, matmul, times
+from layerjax.transport.statistical.streams import (
+    DIFFUSE,
+    NODES,
+    STREAMS,
+    WEIGHTS,
+    InterfaceMatrices,
+    dot,
+    interface_matrices,
+    matmul,
+    matvec,
+)
 
 STEPS = 18
 """Doublings of a slab: from one thinner than 0.02 to half of the thickest medium of the box, 1e4."""
@@ -27,56 +37,58 @@ MOMENTS = 2 * STREAMS
 """Moments of a phase function that are used; the rest of it counts as ballistic light (delta-M)."""
 
 
-class Below(NamedTuple):
+class LowerLayers(NamedTuple):
     """What lies under a level of a stack, over a base that absorbs. Leading axes: channels or 1.
 
-    onward: share of each stream that falls on it that arrives at the base, (C or 1, STREAMS). reflected: what it sends
+    arrival: share of each stream that falls on it that arrives at the base, (C or 1, STREAMS). reflected: what it sends
     back, (C or 1, STREAMS, STREAMS), None if nothing. returned: share of diffuse light from the base that comes back to
     it, (C or 1,). ratio: index at this level over that above the base, squared.
     """
 
-    onward: Array
+    arrival: Array
     reflected: Array | None
     returned: Array
     ratio: Array
 
 
-def base(dtype: Any) -> Below:
-    """The base itself."""
+def black_base(dtype: Any) -> LowerLayers:
+    """The base itself, as black."""
     zero, whole = jnp.zeros(1, dtype), jnp.asarray(DIFFUSE, dtype)[None]
-    return Below(whole, None, zero, jnp.ones((), dtype))
+    return LowerLayers(whole, None, zero, jnp.ones((), dtype))
 
 
-def under_face(below: Below, what: Face, ior: Array) -> Below:
+def add_interface(below: LowerLayers, what: InterfaceMatrices, ior: Array) -> LowerLayers:
     """An interface on top. ior: index below it over that above."""
-    return _under(below, what, below.ratio / (ior * ior))
+    return _add(below, what, below.ratio / (ior * ior))
 
 
-def under_medium(below: Below, medium: Medium) -> Below:
+def add_medium(below: LowerLayers, medium: Medium) -> LowerLayers:
     """A medium on top."""
-    dtype = below.onward.dtype
+    dtype = below.arrival.dtype
     if is_known(medium.albedo, 0.0):
         passed = ballistic(collisions(medium, dtype))
         reflected = None if below.reflected is None else passed[:, :, None] * below.reflected * passed[:, None, :]
-        return below._replace(onward=below.onward * passed, reflected=reflected)
+        return below._replace(arrival=below.arrival * passed, reflected=reflected)
     reflected, passed = _slab_of(medium, dtype)
-    return _under(below, Face(passed, passed, reflected, reflected), below.ratio)
+    return _add(below, InterfaceMatrices(passed, passed, reflected, reflected), below.ratio)
 
 
-def under_layers(below: Below, layers: Sequence[Interface | Medium]) -> tuple[Below, Array]:
+def add_layers(below: LowerLayers, layers: Sequence[Interface | Medium]) -> tuple[LowerLayers, Array]:
     """All these layers on top, and the index above what they lie on."""
-    dtype = below.onward.dtype
+    dtype = below.arrival.dtype
     interfaces = [layer for layer in layers if isinstance(layer, Interface)]
     indices = [jnp.ones((), dtype), *(jnp.asarray(layer.ior, dtype) for layer in interfaces)]
     ratios = [behind / before for before, behind in pairwise(indices)]
-    together = face(jnp.stack([jnp.asarray(layer.alpha, dtype) for layer in interfaces]), jnp.stack(ratios))
+    together = interface_matrices(
+        jnp.stack([jnp.asarray(layer.alpha, dtype) for layer in interfaces]), jnp.stack(ratios)
+    )
     k = len(interfaces)
     for layer in reversed(layers):
         if isinstance(layer, Medium):
-            below = under_medium(below, layer)
+            below = add_medium(below, layer)
         else:
             k -= 1
-            below = under_face(below, Face(*(part[k] for part in together)), ratios[k])
+            below = add_interface(below, InterfaceMatrices(*(part[k] for part in together)), ratios[k])
     return below, indices[-1]
 
 
@@ -102,41 +114,41 @@ def _channels(value: Any, dtype: Any) -> Array:
     return jnp.stack(per_channel(jnp.asarray(value, dtype)))
 
 
-def _under(below: Below, what: Face, ratio: Array) -> Below:
-    met = meeting(below, what.bottom)
+def _add(below: LowerLayers, what: InterfaceMatrices, ratio: Array) -> LowerLayers:
+    met = inter_reflection(below, what.bottom)
     reflected = what.top
     if below.reflected is not None:
         reflected = reflected + matmul(what.up, matmul(below.reflected, matmul(met.turns, what.down)))
-    return Below(times(jnp.swapaxes(what.down, -1, -2), met.onward), reflected, met.returned, ratio)
+    return LowerLayers(matvec(jnp.swapaxes(what.down, -1, -2), met.arrival), reflected, met.returned, ratio)
 
 
-class Meeting(NamedTuple):
+class InterReflection(NamedTuple):
     """What lies under a level, and what is above it and turns light back.
 
-    onward: share of each stream down there that arrives at the base, at once or later. arriving_again: of each stream
+    arrival: share of each stream down there that arrives at the base, at once or later. second_arrival: of each stream
     up there. returned: of diffuse light from the base what comes back. turns: of light down there to all that ever goes
     down.
     """
 
-    onward: Array
-    arriving_again: Array
+    arrival: Array
+    second_arrival: Array
     returned: Array
     turns: Array
 
 
-def meeting(below: Below, bottom: Array) -> Meeting:
+def inter_reflection(below: LowerLayers, bottom: Array) -> InterReflection:
     """bottom: what is above sends back of light from below, (C or 1, STREAMS, STREAMS)."""
     turns = jnp.asarray(np.eye(STREAMS), bottom.dtype)
-    onward = below.onward
+    arrival = below.arrival
     if below.reflected is not None:
         turns = inverse(turns - matmul(bottom, below.reflected))
-        onward = times(jnp.swapaxes(turns, -1, -2), onward)
-    arriving_again = times(jnp.swapaxes(bottom, -1, -2), onward)
-    emitted = below.onward * below.ratio  # of diffuse light from the base, by reciprocity
-    return Meeting(onward, arriving_again, below.returned + dot(arriving_again, emitted), turns)
+        arrival = matvec(jnp.swapaxes(turns, -1, -2), arrival)
+    second_arrival = matvec(jnp.swapaxes(bottom, -1, -2), arrival)
+    emitted = below.arrival * below.ratio  # of diffuse light from the base, by reciprocity
+    return InterReflection(arrival, second_arrival, below.returned + dot(second_arrival, emitted), turns)
 
 
-class Roof(NamedTuple):
+class UpperLayers(NamedTuple):
     """An interface, and media under it. bottom: what they send back of light from below; inside: of light just behind
     the interface what falls on what lies under the media. (C or 1, STREAMS, STREAMS) each.
     """
@@ -145,21 +157,21 @@ class Roof(NamedTuple):
     inside: Array
 
 
-def roof(what: Face) -> Roof:
+def first_interface(what: InterfaceMatrices) -> UpperLayers:
     """The interface alone."""
-    return Roof(what.bottom[None], jnp.asarray(np.eye(STREAMS), what.bottom.dtype)[None])
+    return UpperLayers(what.bottom[None], jnp.asarray(np.eye(STREAMS), what.bottom.dtype)[None])
 
 
-def over_medium(above: Roof, medium: Medium) -> Roof:
+def append_medium(above: UpperLayers, medium: Medium) -> UpperLayers:
     """A medium more under it."""
     dtype = above.bottom.dtype
     if is_known(medium.albedo, 0.0):
         passed = ballistic(collisions(medium, dtype))
-        return Roof(passed[:, :, None] * above.bottom * passed[:, None, :], passed[:, :, None] * above.inside)
+        return UpperLayers(passed[:, :, None] * above.bottom * passed[:, None, :], passed[:, :, None] * above.inside)
     reflected, passed = _slab_of(medium, dtype)
     turns = inverse(jnp.asarray(np.eye(STREAMS), dtype) - matmul(above.bottom, reflected))
     falling = matmul(passed, turns)
-    return Roof(reflected + matmul(falling, matmul(above.bottom, passed)), matmul(falling, above.inside))
+    return UpperLayers(reflected + matmul(falling, matmul(above.bottom, passed)), matmul(falling, above.inside))
 
 
 def slab(thickness: Array, albedo: Array, g: Array) -> tuple[Array, Array]:
@@ -182,22 +194,22 @@ def slab(thickness: Array, albedo: Array, g: Array) -> tuple[Array, Array]:
     def doubled(carried: tuple[Array, Array, Array], _: None) -> tuple[tuple[Array, Array, Array], None]:
         net, sums, taken = carried
         turns = 2.0 * inverse(one + matmul(net, sums))
-        taken = times(turns, taken)
-        return (_anchored(matmul(turns, net), taken), matmul(jnp.swapaxes(turns, -1, -2), sums), taken), None
+        taken = matvec(turns, taken)
+        return (_conserve_diffuse(matmul(turns, net), taken), matmul(jnp.swapaxes(turns, -1, -2), sums), taken), None
 
     one = jnp.asarray(np.eye(STREAMS), thickness.dtype)
     thin = (thickness * 0.5 ** (STEPS + 1))[:, None]
     taken = thin * absorbed[:, None] * removed * jnp.asarray(DIFFUSE, thickness.dtype)
-    begin = _anchored(thin[..., None] * rate(0), taken), thin[..., None] * rate(1), taken
+    begin = _conserve_diffuse(thin[..., None] * rate(0), taken), thin[..., None] * rate(1), taken
     (net, sums, _), _ = jax.lax.scan(doubled, begin, None, length=STEPS)
     even, odd = inverse(one + net), inverse(one + sums)
     return even - odd, even + odd - one
 
 
-def _anchored(net: Array, taken: Array) -> Array:
+def _conserve_diffuse(net: Array, taken: Array) -> Array:
     """Z, with what it takes of diffuse light known by itself: rounding would absorb light in the thickest media."""
     diffuse = jnp.asarray(DIFFUSE, net.dtype)
-    remainder = taken - times(net, diffuse)
+    remainder = taken - matvec(net, diffuse)
     mean = dot(remainder, diffuse)[..., None, None]
     sides = remainder[..., :, None] * diffuse
     return net + sides + jnp.swapaxes(sides, -1, -2) - mean * diffuse[:, None] * diffuse
@@ -226,7 +238,7 @@ def inverse(matrix: Array) -> Array:
 
 
 @inverse.defjvp
-@broadcasting
+@allow_broadcasting
 def _inverse_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
     result = inverse(*primals)
     return result, -matmul(result, matmul(tangents[0], result))

@@ -21,9 +21,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from layerjax._numerics import at_least, horizon
-from layerjax.channels import Channels, each, per_channel, select, times, total
-from layerjax.directions import Vector, sanitised
+from layerjax._numerics import clamp_min, horizon
+from layerjax.channels import Channels, map_channels, multiply, per_channel, select, total
+from layerjax.directions import Vector, sanitise
 from layerjax.stack import Interface, Medium, Stack, is_known
 from layerjax.surfaces import Lambertian
 from layerjax.transport.statistical import stream_layers, streams
@@ -39,14 +39,14 @@ NARROW = 0.1
 wide; where media absorb they have less of what errs one way on the way there and the other way on the way back."""
 
 
-class Second(NamedTuple):
+class SecondInterface(NamedTuple):
     """The second interface: its width, the index behind it over that before it, and of the light behind it what arrives
     at the base, by polynomials and channels; None if it lies on the base.
     """
 
     alpha: Array
     ior: Array
-    onward: Channels | None
+    arrival: Channels | None
 
 
 class ClosedForm(eqx.Module):
@@ -61,15 +61,15 @@ class ClosedForm(eqx.Module):
         """BRDF of the light that has reached the base, 0 unless both directions are above."""
         edge = horizon(wi[2].dtype)
         valid = (wi[2] > edge) & (wo[2] > edge)
-        there, back = (self.arriving(sanitised(w, valid)[2]) for w in (wi, wo))
-        return select(valid, times(there, back, self.level))
+        there, back = (self.transmittance(sanitise(w, valid)[2]) for w in (wi, wo))
+        return select(valid, multiply(there, back, self.level))
 
     def albedo(self, wi: Vector) -> Channels:
         """Energy of `value` for light along wi, above."""
-        return times(self.arriving(wi[2]), self.energy)
+        return multiply(self.transmittance(wi[2]), self.energy)
 
     @abc.abstractmethod
-    def arriving(self, cosine: Array) -> Channels:
+    def transmittance(self, cosine: Array) -> Channels:
         """T, the share of light along a cosine that arrives at the base."""
 
 
@@ -77,7 +77,7 @@ class StreamedBase(ClosedForm):
     """What becomes of light behind the first interface. (STREAMS,) by polynomials, and by channels.
 
     alpha, ior: of the interface. depth: of the media behind it, optically, but for forward peaks; None if none.
-    onward: share of the light behind these that arrives at the base. arriving_again: of light that goes up there,
+    arrival: share of the light behind these that arrives at the base. second_arrival: of light that goes up there,
     passes them, and comes back from the interface. scattered: what of light just behind the interface arrives, and of
     light that goes up there, if it is scattered in the media; None if it is not.
     """
@@ -85,18 +85,18 @@ class StreamedBase(ClosedForm):
     alpha: Array
     ior: Array
     depth: Channels | None
-    onward: Channels
-    arriving_again: Channels
+    arrival: Channels
+    second_arrival: Channels
     scattered: tuple[Channels, Channels] | None
-    second: Second | None
+    second: SecondInterface | None
 
-    def arriving(self, cosine: Array) -> Channels:
+    def transmittance(self, cosine: Array) -> Channels:
         """Share of light along a cosine that arrives at the base."""
         passed, shares = streams.entering(cosine, self.alpha, self.ior)
-        there = _along_two(self, 1.0 - passed, *streams.two_cosines(shares))
+        there = _ballistic_arrival(self, 1.0 - passed, *streams.two_cosines(shares))
         if self.scattered is not None:
-            there = each(lambda t, row: t + streams.along(shares, row), there, self.scattered[0])
-        return tuple(passed * at_least(t, 0.0) for t in there)
+            there = map_channels(lambda t, row: t + streams.arrival_share(shares, row), there, self.scattered[0])
+        return tuple(passed * clamp_min(t, 0.0) for t in there)
 
 
 def is_streamed(stack: Stack) -> bool:
@@ -112,47 +112,49 @@ def make_streamed(stack: Stack) -> StreamedBase:
     indices = [jnp.ones((), dtype), *(jnp.asarray(layer.ior, dtype) for layer in interfaces)]
     alphas = [jnp.asarray(layer.alpha, dtype) for layer in interfaces]
     ratios = [behind / before for before, behind in pairwise(indices)]
-    together = streams.face(jnp.stack(alphas), jnp.stack(ratios))  # at one look
-    faces = [streams.Face(*(part[k] for part in together)) for k in range(len(alphas))]
+    together = streams.interface_matrices(jnp.stack(alphas), jnp.stack(ratios))  # at one look
+    faces = [streams.InterfaceMatrices(*(part[k] for part in together)) for k in range(len(alphas))]
     end = next((k for k, layer in enumerate(stack.layers) if k and isinstance(layer, Interface)), len(stack.layers))
-    bottom = below = stream_layers.base(dtype)
+    bottom = below = stream_layers.black_base(dtype)
     second, k = None, len(faces)
     for layer in reversed(stack.layers[end:]):
         if isinstance(layer, Medium):
-            below = stream_layers.under_medium(below, layer)
+            below = stream_layers.add_medium(below, layer)
             continue
         k -= 1
-        onward = None if below is bottom else per_channel(streams.by_polynomials(below.onward))
-        second = Second(alphas[k], ratios[k], onward)
-        below = stream_layers.under_face(below, faces[k], ratios[k])
+        onward = None if below is bottom else per_channel(streams.polynomial_coefficients(below.arrival))
+        second = SecondInterface(alphas[k], ratios[k], onward)
+        below = stream_layers.add_interface(below, faces[k], ratios[k])
     media = [layer for layer in stack.layers[1:end] if isinstance(layer, Medium)]
-    roof = stream_layers.roof(faces[0])
+    upper = stream_layers.first_interface(faces[0])
     for medium in media:
-        roof = stream_layers.over_medium(roof, medium)
-    met = stream_layers.meeting(below, roof.bottom)
+        upper = stream_layers.append_medium(upper, medium)
+    met = stream_layers.inter_reflection(below, upper.bottom)
     depth = _depth(media, dtype)
-    behind = streams.times(jnp.swapaxes(roof.inside, -1, -2), met.onward)
-    arriving_again, scattered = met.arriving_again, None
+    behind = streams.matvec(jnp.swapaxes(upper.inside, -1, -2), met.arrival)
+    second_arrival, scattered = met.second_arrival, None
     if not all(map(absorbs, media)):
         assert depth is not None
         ballistic = stream_layers.ballistic(jnp.stack(depth))
-        once = met.onward * ballistic
-        arriving_again = ballistic * streams.times(jnp.swapaxes(faces[0].bottom, -1, -2), once)
-        down, up = (streams.by_polynomials(part) for part in (behind - once, met.arriving_again - arriving_again))
+        once = met.arrival * ballistic
+        second_arrival = ballistic * streams.matvec(jnp.swapaxes(faces[0].bottom, -1, -2), once)
+        down, up = (
+            streams.polynomial_coefficients(part) for part in (behind - once, met.second_arrival - second_arrival)
+        )
         scattered = per_channel(down), per_channel(up)
-    out = streams.times(jnp.swapaxes(faces[0].down, -1, -2), behind)
+    out = streams.matvec(jnp.swapaxes(faces[0].down, -1, -2), behind)
     leaving = per_channel(streams.dot(out, jnp.asarray(streams.DIFFUSE, dtype)) / indices[-1] ** 2)  # by reciprocity
     albedo, returned, one = per_channel(jnp.asarray(stack.base.albedo)), per_channel(met.returned), jnp.ones((), dtype)
     return StreamedBase(
         alpha=alphas[0],
         ior=indices[1],
         depth=depth,
-        onward=per_channel(streams.by_polynomials(met.onward)),
-        arriving_again=per_channel(streams.by_polynomials(arriving_again)),
+        arrival=per_channel(streams.polynomial_coefficients(met.arrival)),
+        second_arrival=per_channel(streams.polynomial_coefficients(second_arrival)),
         scattered=scattered,
         second=second,
-        level=each(lambda r, rho: closed_form(one, one, r, rho, indices[-1]), returned, albedo),
-        energy=each(lambda out, r, rho: indirect_energy(one, out, r, rho), leaving, returned, albedo),
+        level=map_channels(lambda r, rho: closed_form(one, one, r, rho, indices[-1]), returned, albedo),
+        energy=map_channels(lambda out, r, rho: indirect_energy(one, out, r, rho), leaving, returned, albedo),
     )
 
 
@@ -161,29 +163,31 @@ def _depth(media: list[Medium], dtype: np.dtype) -> Channels | None:
     return total([per_channel(stream_layers.collisions(medium, dtype)) for medium in media]) if media else None
 
 
-def _along_two(part: StreamedBase, reflectance: Array, cosines: Array, weights: Array, spread: Array) -> Channels:
+def _ballistic_arrival(
+    part: StreamedBase, reflectance: Array, cosines: Array, weights: Array, spread: Array
+) -> Channels:
     """Share of light behind the first interface, along cosines (2, ...), that arrives without a collision.
 
     reflectance: of that interface, from outside and, of a beam, from inside.
     """
     values = streams.polynomials(cosines)
-    arriving: Channels = tuple(streams.along(values, row) for row in part.onward)
+    arriving: Channels = tuple(streams.arrival_share(values, row) for row in part.arrival)
     through = (jnp.ones_like(spread),) if part.depth is None else tuple(jnp.exp(-d / cosines) for d in part.depth)
     if part.second is not None:
         passed, shares = streams.entering(cosines, part.second.alpha, part.second.ior)
         once: Channels = (passed,)
-        if part.second.onward is not None:
-            once = tuple(passed * streams.along(shares, row) for row in part.second.onward)
+        if part.second.arrival is not None:
+            once = tuple(passed * streams.arrival_share(shares, row) for row in part.second.arrival)
         narrow = 1.0 / (1.0 + (spread / TURNED) ** 2)
-        back: Channels = tuple((1.0 - narrow) * streams.along(values, row) for row in part.arriving_again)
+        back: Channels = tuple((1.0 - narrow) * streams.arrival_share(values, row) for row in part.second_arrival)
         if part.scattered is not None:
-            back = each(lambda b, row: b + streams.along(values, row), back, part.scattered[1])
+            back = map_channels(lambda b, row: b + streams.arrival_share(values, row), back, part.scattered[1])
         turns = tuple(1.0 - narrow * reflectance * (1.0 - passed) * t * t for t in through)
-        beam = each(lambda o, b, turns: (o + (1.0 - passed) * b) / turns, once, back, turns)
+        beam = map_channels(lambda o, b, turns: (o + (1.0 - passed) * b) / turns, once, back, turns)
         wide = part.second.alpha**4 / (part.second.alpha**4 + NARROW**4)
         share = tuple((1.0 - wide * t * t) / (1.0 + (spread / BEAM) ** 2) for t in through)
-        arriving = each(lambda f, b, s: f + s * (b - f), arriving, beam, share)
-    return tuple(jnp.sum(weights * f, axis=0) for f in times(arriving, through))
+        arriving = map_channels(lambda f, b, s: f + s * (b - f), arriving, beam, share)
+    return tuple(jnp.sum(weights * f, axis=0) for f in multiply(arriving, through))
 
 
 def absorbs(layer: Interface | Medium) -> bool:

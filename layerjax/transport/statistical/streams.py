@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from layerjax._numerics import at_least, at_most
+from layerjax._numerics import clamp_max, clamp_min
 from layerjax.microsurface.energy_tables import dielectric_places, index_variable, interface_energies
 from layerjax.microsurface.splines import read
 from layerjax.quadrature import gauss_legendre
@@ -45,7 +45,7 @@ NODES, WEIGHTS = gauss_legendre(STREAMS)
 def polynomials(cosine: Array | np.ndarray) -> Array:
     """The polynomials that are orthonormal in 2 u du on [0, 1], (..., STREAMS); the first is 1."""
     powers = jnp.stack([cosine**j for j in range(STREAMS)], axis=-1)
-    return times(jnp.asarray(_coefficients(), powers.dtype), powers)
+    return matvec(jnp.asarray(_coefficients(), powers.dtype), powers)
 
 
 @functools.cache
@@ -68,7 +68,7 @@ LEAST_SPREAD, SKEWED, LEAST_COSINE = 1e-4, 3e-3, 0.02
 """Of a lobe: its least variance, that at which its skewness fades, and the least of the two cosines."""
 
 
-class Face(NamedTuple):
+class InterfaceMatrices(NamedTuple):
     """An interface between diffuse light, at the nodes: down and up through it, and back from above and from below."""
 
     down: Array
@@ -104,9 +104,9 @@ def _columns(name: str, start: Array | np.ndarray, counts: Sequence[Any], places
     return found
 
 
-def along(shares: Array, onward: Array) -> Array:
+def arrival_share(shares: Array, arrival: Array) -> Array:
     """Share of such light that arrives, by its polynomials."""
-    return dot(shares, onward)
+    return dot(shares, arrival)
 
 
 def two_cosines(shares: Array) -> tuple[Array, Array, Array]:
@@ -116,23 +116,23 @@ def two_cosines(shares: Array) -> tuple[Array, Array, Array]:
     Of a beam, whose third moment is the rounding of a table, they are even about the mean.
     """
     _, mean, square, cube = (dot(shares, jnp.asarray(row, shares.dtype)) for row in _MOMENTS_OF)
-    spread = at_least(square - mean * mean, LEAST_SPREAD)
+    spread = clamp_min(square - mean * mean, LEAST_SPREAD)
     skew = cube - mean * (3.0 * square - 2.0 * mean * mean)
     lean = skew * spread / (spread * spread + SKEWED * SKEWED)
     apart = jnp.sqrt(lean * lean + 4.0 * spread)
     low, high = mean + 0.5 * (lean - apart), mean + 0.5 * (lean + apart)
     share = (mean - low) / apart
-    cosines = at_most(at_least(jnp.stack([low, high]), LEAST_COSINE), 1.0)
+    cosines = clamp_max(clamp_min(jnp.stack([low, high]), LEAST_COSINE), 1.0)
     return cosines, jnp.stack([1.0 - share, share]), spread
 
 
-def face(alpha: Array, ior: Array) -> Face:
+def interface_matrices(alpha: Array, ior: Array) -> InterfaceMatrices:
     """An interface. ior: index below it over that above."""
     inverted = ior < 1.0
     dense = jnp.where(inverted, 1.0 / ior, ior)
     places = roughness_variable(alpha), index_variable(dense)
     entries = _columns("interface", int(np.prod(INTERFACES)) * np.arange(ENTRIES), INTERFACES, places)
-    inward, outer, inner = unpacked(entries, dense)
+    inward, outer, inner = unpack(entries, dense)
     outward = jnp.swapaxes(inward, -1, -2) / (dense * dense)[..., None, None]
     turn = jnp.asarray(AT_NODES, entries.dtype)
     inward, outward, outer, inner = (matmul(matmul(turn, part), turn.T) for part in (inward, outward, outer, inner))
@@ -141,17 +141,19 @@ def face(alpha: Array, ior: Array) -> Face:
     def chosen(dense_below: Array, dense_above: Array) -> Array:
         return jnp.where(flipped, dense_above, dense_below)
 
-    return Face(chosen(inward, outward), chosen(outward, inward), chosen(outer, inner), chosen(inner, outer))
+    return InterfaceMatrices(
+        chosen(inward, outward), chosen(outward, inward), chosen(outer, inner), chosen(inner, outer)
+    )
 
 
-def packed(inward: np.ndarray, outer: np.ndarray, inner: np.ndarray) -> np.ndarray:
+def pack(inward: np.ndarray, outer: np.ndarray, inner: np.ndarray) -> np.ndarray:
     """The entries of an interface that a table holds, (..., ENTRIES), of matrices (..., STREAMS, STREAMS)."""
     rows, columns = np.triu_indices(STREAMS - 1)
     parts = [part[..., 1 + rows, 1 + columns] for part in (outer, inner)]
     return np.concatenate([inward.reshape(*inward.shape[:-2], -1), *parts], axis=-1)
 
 
-def unpacked(entries: Array, dense: Array) -> tuple[Array, Array, Array]:
+def unpack(entries: Array, dense: Array) -> tuple[Array, Array, Array]:
     """Transmission into the denser side and both reflections; their first rows are what is not transmitted."""
     whole = STREAMS * STREAMS
     inward = entries[..., :whole].reshape(*entries.shape[:-1], STREAMS, STREAMS)
@@ -168,9 +170,9 @@ def unpacked(entries: Array, dense: Array) -> tuple[Array, Array, Array]:
     return inward, outer, inner
 
 
-def by_polynomials(onward: Array) -> Array:
+def polynomial_coefficients(arrival: Array) -> Array:
     """Matrix from streams to polynomials."""
-    return times(jnp.asarray(AT_NODES.T, onward.dtype), onward)
+    return matvec(jnp.asarray(AT_NODES.T, arrival.dtype), arrival)
 
 
 def matmul(a: Array, b: Array) -> Array:
@@ -183,7 +185,7 @@ def matmul(a: Array, b: Array) -> Array:
     return dot(a[..., :, None, :], jnp.swapaxes(b, -1, -2)[..., None, :, :])
 
 
-def times(matrix: Array, vector: Array) -> Array:
+def matvec(matrix: Array, vector: Array) -> Array:
     """Product of a small matrix and a vector."""
     return dot(matrix, vector[..., None, :])
 

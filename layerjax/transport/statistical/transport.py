@@ -20,7 +20,7 @@ from layerjax._devices import exact_products
 from layerjax._numerics import horizon, safe_div, safe_sqrt
 from layerjax._parameters import is_placeholder
 from layerjax.channels import Channels
-from layerjax.directions import Vector, add, dot, flip, half_vector, reflect, sanitised, select
+from layerjax.directions import Vector, add, dot, flip, half_vector, reflect, sanitise, select
 from layerjax.microsurface.energy_tables import LARGEST_INDEX
 from layerjax.normals.facets import reflection_pdf
 from layerjax.normals.ggx import ggx_area, ggx_density, ggx_sample
@@ -29,34 +29,34 @@ from layerjax.stack import Interface, Medium, Stack
 from layerjax.surfaces import Conductor, Surface
 from layerjax.surfaces.interface import interface_reflection
 from layerjax.transport.contract import TEXELS, DeterministicTransport, Side, refuse_vmf
-from layerjax.transport.known_directions import Known
+from layerjax.transport.known_directions import DirectionLookup
 from layerjax.transport.statistical.coated_base import is_coated, make_coated
 from layerjax.transport.statistical.diffuse_base import make_diffuse
 from layerjax.transport.statistical.diffuse_lobe import make_diffuse_lobe, why_no_lobe
-from layerjax.transport.statistical.drawing import (
+from layerjax.transport.statistical.hazy_base import is_hazy, make_hazy
+from layerjax.transport.statistical.lobes import Options, Scattering, bound_alpha, smooth_parts
+from layerjax.transport.statistical.microfacet_lobes import (
+    Facet,
+    MicrofacetLobes,
+    fold,
+    index_below,
+    microfacet_lobes,
+    reference_index,
+    unfold,
+)
+from layerjax.transport.statistical.sampling import (
     DiffusePart,
     density,
     diffuse_energy,
     diffuse_part,
     draw,
 )
-from layerjax.transport.statistical.hazy_base import is_hazy, make_hazy
-from layerjax.transport.statistical.lobes import Options, Scattering, bounded, smooth_parts
-from layerjax.transport.statistical.shaped import (
-    Facet,
-    Shaped,
-    folded,
-    index_below,
-    reference_index,
-    shaped,
-    unfolded,
-)
 from layerjax.transport.statistical.streamed_base import is_streamed, make_streamed
 
 INDEX_SLACK = 1e-6
 """Of the logarithm of a ratio of indices: those that are given in single precision are rounded."""
 
-LANES = 8
+LEAST_PAIRS = 8
 """Pairs of directions from which on channels are an axis of the lobes' program. Of fewer (a texel has one), processors,
 which work on so many numbers at once, would run along the channels, of which there are 3."""
 
@@ -64,7 +64,7 @@ Diffuse = Literal["tables", "exact", "lobe"]
 Energies = tuple[Channels, Channels]
 
 
-class Lit(eqx.Module):
+class StatisticalState(eqx.Module):
     """A stack, the diffuse part of its light, and the indices below it and of where transmitted lobes are described."""
 
     stack: Stack
@@ -74,7 +74,7 @@ class Lit(eqx.Module):
     smooth: tuple[bool, ...] = eqx.field(static=True)
 
     @property
-    def passes(self) -> bool:
+    def is_open(self) -> bool:
         """Whether there is no base."""
         return self.stack.base is None
 
@@ -145,76 +145,76 @@ class Statistical(DeterministicTransport):
             if reason is not None:
                 raise ValueError(f'{reason}; Statistical(diffuse="exact") takes any')
 
-    def prepare(self, stack: Stack) -> Lit:
+    def prepare(self, stack: Stack) -> StatisticalState:
         diffuse: DiffusePart | None = None
         if stack.base is not None and _is_diffuse(stack.base):
             if not stack.layers:
                 diffuse = stack.base
             elif self.diffuse == "lobe":
                 diffuse = make_diffuse_lobe(stack)
-            elif self._solves(stack):
+            elif self._needs_solver(stack):
                 diffuse = make_diffuse(stack, stack.base, self.facet_multiple_scattering)
             else:
                 diffuse = _closed_form(stack)
-        return Lit(stack, diffuse, index_below(stack), reference_index(stack), smooth_parts(stack))
+        return StatisticalState(stack, diffuse, index_below(stack), reference_index(stack), smooth_parts(stack))
 
-    def for_tracing(self, stack: Stack, known: Known) -> "Statistical | None":
+    def traceable_equivalent(self, stack: Stack, known: DirectionLookup) -> "Statistical | None":
         """Itself, but where alphas are known to be as narrow as can be, which are traced as any others would be."""
-        return None if any(smooth_parts(stack)) or self._solves(stack) else self
+        return None if any(smooth_parts(stack)) or self._needs_solver(stack) else self
 
-    def evaluate(self, state: Lit, wi: Vector, wo: Vector, side: Side) -> Channels:
+    def evaluate(self, state: StatisticalState, wi: Vector, wo: Vector, side: Side) -> Channels:
         def lobes(stack: Stack) -> Channels:
             one = dataclasses.replace(state, stack=stack)
             parts: list[Channels] = [(jnp.zeros_like(wi[2] * wo[2]),)]
             if side != "transmission":
                 parts += self._reflections(one, wi, wo, upward=False)
-            if side == "all" and state.passes:
+            if side == "all" and state.is_open:
                 parts += self._reflections(one, flip(wi), flip(wo), upward=True)
-            if side != "reflection" and state.passes:
+            if side != "reflection" and state.is_open:
                 parts += self._transmissions(one, wi, wo)
             return channels.total(parts)
 
-        few = jnp.size(wi[2] * wo[2]) < LANES
-        found = lobes(state.stack) if few else channels.by_channel(lambda stack: lobes(stack)[0], state.stack)
+        few = jnp.size(wi[2] * wo[2]) < LEAST_PAIRS
+        found = lobes(state.stack) if few else channels.vmap_channels(lambda stack: lobes(stack)[0], state.stack)
         if state.diffuse is None or side == "transmission":
             return found
         return channels.total([found, diffuse_part(state.diffuse, wi, wo)])
 
-    def sample(self, state: Lit, wi: Vector, uniforms: tuple[Array, Array, Array]) -> Vector:
+    def sample(self, state: StatisticalState, wi: Vector, uniforms: tuple[Array, Array, Array]) -> Vector:
         down = draw(self._lobes(state, wi, False), state.diffuse, wi, uniforms, *_ratios(state))
-        if not state.passes:
+        if not state.is_open:
             return down
         wi_below = flip(wi)
         up = draw(self._lobes(state, wi_below, True), None, wi_below, uniforms, *_ratios(state)[::-1])
         return select(wi[2] > 0, down, flip(up))
 
-    def pdf(self, state: Lit, wi: Vector, wo: Vector) -> Array:
+    def pdf(self, state: StatisticalState, wi: Vector, wo: Vector) -> Array:
         down = density(self._lobes(state, wi, False), state.diffuse, wi, wo, *_ratios(state))
-        if not state.passes:
+        if not state.is_open:
             return down
         wi_below = flip(wi)
         up = density(self._lobes(state, wi_below, True), None, wi_below, flip(wo), *_ratios(state)[::-1])
         return jnp.where(wi[2] > 0, down, up)
 
-    def albedo(self, state: Lit, wi: Vector, nodes: int) -> Energies:
+    def albedo(self, state: StatisticalState, wi: Vector, nodes: int) -> Energies:
         """Forward: the energies of the lobes. Symmetric: by quadrature, 2 nodes^2 points a lobe."""
         above = wi[2] > horizon(wi[2].dtype)
-        near, far = self._energies(state, sanitised(wi, above), nodes, upward=False)
+        near, far = self._energies(state, sanitise(wi, above), nodes, upward=False)
         if state.diffuse is not None:
-            near = channels.total([near, diffuse_energy(state.diffuse, sanitised(wi, above), nodes)])
-        if not state.passes:
+            near = channels.total([near, diffuse_energy(state.diffuse, sanitise(wi, above), nodes)])
+        if not state.is_open:
             return channels.select(above, near), (jnp.zeros_like(wi[2]),)
         below = wi[2] < -horizon(wi[2].dtype)
-        other = self._energies(state, sanitised(flip(wi), below), nodes, upward=True)
+        other = self._energies(state, sanitise(flip(wi), below), nodes, upward=True)
         sides = []
         for down, up in zip((near, far), other, strict=True):
             sides.append(channels.select(above, down, channels.select(below, up)))
         return sides[0], sides[1]
 
-    def together(self, stack: Stack) -> int:
-        return 1 if self._solves(stack) else TEXELS
+    def texel_batch_size(self, stack: Stack) -> int:
+        return 1 if self._needs_solver(stack) else TEXELS
 
-    def _solves(self, stack: Stack) -> bool:
+    def _needs_solver(self, stack: Stack) -> bool:
         """Whether the diffuse part of a simplified stack needs a solve of its own."""
         if stack.base is None or not _is_diffuse(stack.base) or not stack.layers:
             return False
@@ -222,27 +222,27 @@ class Statistical(DeterministicTransport):
             self.diffuse != "tables" or not self.facet_multiple_scattering or not (is_streamed(stack) or is_hazy(stack))
         )
 
-    def _shaped(self, state: Lit, cosine: Array, upward: bool) -> Shaped:
+    def _microfacet_lobes(self, state: StatisticalState, cosine: Array, upward: bool) -> MicrofacetLobes:
         options = Options(self.facet_multiple_scattering, self.scattering, self.angles, self.own_side, state.smooth)
-        return shaped(state.stack, options, cosine, upward)
+        return microfacet_lobes(state.stack, options, cosine, upward)
 
-    def _lobes(self, state: Lit, wi: Vector, upward: bool) -> Shaped:
+    def _lobes(self, state: StatisticalState, wi: Vector, upward: bool) -> MicrofacetLobes:
         """For light along wi, above (`upward`: turned up); of light that comes from elsewhere, whatever is finite."""
         lit = wi[2] > horizon(wi[2].dtype)
-        return self._shaped(state, jnp.where(lit, wi[2], 1.0), upward)
+        return self._microfacet_lobes(state, jnp.where(lit, wi[2], 1.0), upward)
 
-    def _energies(self, state: Lit, wi: Vector, nodes: int, upward: bool) -> Energies:
+    def _energies(self, state: StatisticalState, wi: Vector, nodes: int, upward: bool) -> Energies:
         if self.symmetric:
-            return self._integrated(state, wi, nodes, upward)
+            return self._integrate(state, wi, nodes, upward)
         return self._lobes(state, wi, upward).energies(jnp.zeros_like(wi[2]))
 
-    def _reflections(self, state: Lit, wi: Vector, wo: Vector, upward: bool) -> list[Channels]:
+    def _reflections(self, state: StatisticalState, wi: Vector, wo: Vector, upward: bool) -> list[Channels]:
         """Every lobe, for light and viewer above (`upward`: turned up)."""
         edge = horizon(wi[2].dtype)
         valid = (wi[2] > edge) & (wo[2] > edge)
-        wi, wo = sanitised(wi, valid), sanitised(wo, valid)
+        wi, wo = sanitise(wi, valid), sanitise(wo, valid)
         h, cosine = half_vector(wi, wo, same_side=True)
-        found = self._shaped(state, cosine if self.symmetric else wi[2], upward)
+        found = self._microfacet_lobes(state, cosine if self.symmetric else wi[2], upward)
         lobes = []
         for lobe in found.reflected:
             if lobe.alpha is None:
@@ -250,26 +250,26 @@ class Statistical(DeterministicTransport):
                 shape = _facet(found.facet, wi, wo)
             else:
                 shape = tuple(_lobe(h, wi, wo, alpha) for alpha in lobe.alpha)
-            lobes.append(channels.select(valid, channels.times(lobe.scale, shape)))
+            lobes.append(channels.select(valid, channels.multiply(lobe.scale, shape)))
         return lobes
 
-    def _transmissions(self, state: Lit, wi: Vector, wo: Vector) -> list[Channels]:
+    def _transmissions(self, state: StatisticalState, wi: Vector, wo: Vector) -> list[Channels]:
         """Every lobe that passes, for light and viewer on different sides: lobes of a reflection, folded over."""
         edge = horizon(wi[2].dtype)
         downward = wi[2] > 0
         over, under = select(downward, wi, wo), flip(select(downward, wo, wi))
         valid = (over[2] > edge) & (under[2] > edge)
-        over, under = sanitised(over, valid), sanitised(under, valid)
+        over, under = sanitise(over, valid), sanitise(under, valid)
         ratio_over, ratio_under = _ratios(state)
-        a, b = folded(over, ratio_over), folded(under, ratio_under)
+        a, b = fold(over, ratio_over), fold(under, ratio_under)
         valid = valid & (a[2] > edge) & (b[2] > edge)
-        a, b = sanitised(a, valid), sanitised(b, valid)
+        a, b = sanitise(a, valid), sanitise(b, valid)
         h, _ = half_vector(a, b, same_side=True)
         if self.symmetric:
             sine = _half_sine(a, b) * state.reference
-            found = [self._shaped(state, safe_sqrt(1.0 - sine * sine), False)] * 2
+            found = [self._microfacet_lobes(state, safe_sqrt(1.0 - sine * sine), False)] * 2
         else:
-            found = [self._shaped(state, w[2], upward) for w, upward in ((over, False), (under, True))]
+            found = [self._microfacet_lobes(state, w[2], upward) for w, upward in ((over, False), (under, True))]
         leaving = jnp.where(downward, ratio_under, ratio_over)
         lobes = []
         for above, below in zip(found[0].transmitted, found[1].transmitted, strict=True):
@@ -278,10 +278,10 @@ class Statistical(DeterministicTransport):
             scale = channels.select(downward, above.scale, below.scale)
             alphas = channels.select(downward, above.alpha, below.alpha)
             shape = tuple(leaving * leaving * _lobe(h, a, b, alpha) for alpha in alphas)  # per solid angle outside
-            lobes.append(channels.select(valid, channels.times(scale, shape)))
+            lobes.append(channels.select(valid, channels.multiply(scale, shape)))
         return lobes
 
-    def _integrated(self, state: Lit, wi: Vector, nodes: int, upward: bool) -> Energies:
+    def _integrate(self, state: StatisticalState, wi: Vector, nodes: int, upward: bool) -> Energies:
         """Energy of every lobe by a quadrature over the facets seen from wi, above (`upward`: turned up)."""
         s, w = (jnp.asarray(array, wi[2].dtype) for array in gauss_legendre(nodes))
         turn = (jnp.arange(2 * nodes, dtype=s.dtype) + 0.5) / (2 * nodes)
@@ -300,14 +300,14 @@ class Statistical(DeterministicTransport):
             lobe = self._reflections(state, wi, wo, upward)[j]
             near.append(tuple(jnp.sum(share * value, axis=-1) for value in lobe))
         entry, exit = _ratios(state)[::-1] if upward else _ratios(state)
-        turned = flip if upward else _same
+        turned = flip if upward else _identity
         for j, width in enumerate(transmitted):
             alpha = width[..., None]
-            a = folded(wi, entry)
+            a = fold(wi, entry)
             m = ggx_sample(a, alpha, u1, u2)
             b = reflect(a, m)
             share = weight * safe_div(jnp.where(b[2] > edge, b[2], 0.0), exit * exit * reflection_pdf(m, a, alpha))
-            lobe = self._transmissions(state, turned(wi), turned(unfolded(b, exit)))[j]
+            lobe = self._transmissions(state, turned(wi), turned(unfold(b, exit)))[j]
             far.append(tuple(jnp.sum(share * value, axis=-1) for value in lobe))
         return channels.total(near), channels.total(far)
 
@@ -341,11 +341,11 @@ def _check_indices(stack: Stack, names: Sequence[str]) -> None:
         above = layer.ior
 
 
-def _same(w: Vector) -> Vector:
+def _identity(w: Vector) -> Vector:
     return w
 
 
-def _ratios(state: Lit) -> tuple[Array, Array]:
+def _ratios(state: StatisticalState) -> tuple[Array, Array]:
     """Indices above and below over that of the medium in which transmitted lobes are described."""
     return 1.0 / state.reference, state.below / state.reference
 
@@ -358,7 +358,7 @@ def _half_sine(wi: Vector, wo: Vector) -> Array:
 
 def _lobe(h: Vector, wi: Vector, wo: Vector, alpha: Array) -> Array:
     """GGX lobe of facets that reflect all, D G / (4 cos cos), 1/sr."""
-    alpha = bounded(alpha)
+    alpha = bound_alpha(alpha)
     area_i, area_o = ggx_area(wi, alpha), ggx_area(wo, alpha)
     return ggx_density(h, alpha) / ((wi[2] + area_i) * (wo[2] + area_o))
 

@@ -7,7 +7,7 @@ the second moment on the disc of directions.
 import jax.numpy as jnp
 from jax import Array
 
-from layerjax._numerics import at_least, at_most, safe_sqrt
+from layerjax._numerics import clamp_max, clamp_min, safe_sqrt
 from layerjax.directions import squared_cosine_of_refraction
 
 EXPONENT = 1.1
@@ -26,17 +26,17 @@ LEAST_G = 1e-3
 def variance(alpha: Array) -> Array:
     """f(alpha) = alpha^1.1 / (1 - alpha^1.1) (Belcour 2018, Eq. 6)."""
     # Eq. (6)
-    return 1.0 / jnp.expm1(-EXPONENT * jnp.log(at_most(at_least(alpha, NARROWEST), WIDEST)))
+    return 1.0 / jnp.expm1(-EXPONENT * jnp.log(clamp_max(clamp_min(alpha, NARROWEST), WIDEST)))
 
 
 def roughness(sigma: Array) -> Array:
     """The roughness of a variance, the inverse of `variance`."""
-    return jnp.exp(-1.0 / EXPONENT * jnp.log1p(1.0 / at_least(sigma, NARROWEST**EXPONENT)))
+    return jnp.exp(-1.0 / EXPONENT * jnp.log1p(1.0 / clamp_min(sigma, NARROWEST**EXPONENT)))
 
 
 def phase_variance(g: Array) -> Array:
     """Variance of the forward lobe of a Henyey-Greenstein phase function (Belcour 2018, Eq. 21)."""
-    g = at_least(g, LEAST_G)
+    g = clamp_min(g, LEAST_G)
     return jnp.exp(0.8 * (jnp.log1p(-g) - jnp.log(g))) / (1.0 + g)
 
 
@@ -60,4 +60,4 @@ def bounded_refracted_cosine(cosine: Array, ior: Array, steepest: float) -> tupl
     """
     squared = squared_cosine_of_refraction(cosine, ior)
     floor = jnp.where(ior < 1.0, 1.0 - steepest * steepest, 0.0)
-    return jnp.sqrt(at_least(squared, floor)), squared > 0
+    return jnp.sqrt(clamp_min(squared, floor)), squared > 0

@@ -7,9 +7,9 @@ import pytest
 
 import layerjax as lj
 from layerjax.microsurface.directional_albedo import (
+    escape_cone_share,
     interface_energies,
     lobe_energy,
-    retained,
 )
 from tests.helpers.metals import conductor_energy
 
@@ -119,17 +119,19 @@ def test_perfect_mirrors_return_everything_and_matched_indices_nothing():
 def test_retained_is_the_part_of_the_lobe_in_the_cone(cosine, alpha, ratio):
     *_, reflected, lobe = over_facets(cosine, alpha, 1.5)
     inside = reflected > np.sqrt(1 - ratio**2)
-    np.testing.assert_allclose(retained(cosine, alpha, ratio), lobe[inside].sum() / lobe.sum(), atol=3e-4)
+    np.testing.assert_allclose(escape_cone_share(cosine, alpha, ratio), lobe[inside].sum() / lobe.sum(), atol=3e-4)
 
 
 def test_retained_at_its_limits():
     np.testing.assert_allclose(
-        retained(jnp.array([0.8164966, 0.8164966]), jnp.array([0.1, 0.3]), 1 / 1.5), [0.725846, 0.530590], atol=1e-3
+        escape_cone_share(jnp.array([0.8164966, 0.8164966]), jnp.array([0.1, 0.3]), 1 / 1.5),
+        [0.725846, 0.530590],
+        atol=1e-3,
     )
-    np.testing.assert_array_equal(retained(0.7, 0.2, jnp.array([1.0, 1.5])), 1.0)
+    np.testing.assert_array_equal(escape_cone_share(0.7, 0.2, jnp.array([1.0, 1.5])), 1.0)
     cosine = jnp.cos(jnp.arcsin(jnp.array([0.59, 0.61])))
-    np.testing.assert_allclose(retained(cosine, 1e-4, 0.6), [1.0, 0.0], atol=1e-3)
-    np.testing.assert_allclose(retained(0.6, 0.2, 1 - 1e-9), 1.0, atol=1e-6)
+    np.testing.assert_allclose(escape_cone_share(cosine, 1e-4, 0.6), [1.0, 0.0], atol=1e-3)
+    np.testing.assert_allclose(escape_cone_share(0.6, 0.2, 1 - 1e-9), 1.0, atol=1e-6)
 
 
 def box(dtype):
@@ -164,7 +166,7 @@ def test_values_and_derivatives_are_finite_over_the_box(dtype):
     quantities = [
         (both_kinds, (cosine, alpha, ior)),
         (lambda c, a, n, k: conductor_energy(c, a, n, k, True), (cosine, alpha, metals, k)),
-        (retained, (cosine, alpha, ior)),
+        (escape_cone_share, (cosine, alpha, ior)),
     ]
     for function, arguments in quantities:
         value, slopes = with_slopes(function)(*arguments)
@@ -186,7 +188,7 @@ COSINE, ALPHA, IOR = (
     [
         (both_kinds, (COSINE, ALPHA, IOR)),
         (lambda c, a, n, k: conductor_energy(c, a, n, k, True), (COSINE, ALPHA, IOR, 2.0 + 0.0 * IOR)),
-        (retained, (COSINE, ALPHA, 0.6 * IOR)),
+        (escape_cone_share, (COSINE, ALPHA, 0.6 * IOR)),
     ],
     ids=["interfaces", "metals", "retained"],
 )
@@ -201,7 +203,9 @@ def test_derivatives_equal_differences(function, arguments):
         np.testing.assert_allclose(slope, (above - below) / (2 * step), rtol=2e-3, atol=2e-4)
 
 
-@pytest.mark.parametrize("function", [pytest.param(lambda *x: single(*x)[0], marks=pytest.mark.slow), retained])
+@pytest.mark.parametrize(
+    "function", [pytest.param(lambda *x: single(*x)[0], marks=pytest.mark.slow), escape_cone_share]
+)
 def test_reverse_derivatives_equal_forward_ones(function):
     x = jnp.array([0.6, 0.3, 0.8])
     reverse, forward = (jax.jit(mode(lambda x: function(*x)))(x) for mode in (jax.grad, jax.jacfwd))

@@ -7,7 +7,7 @@ import pytest
 
 from layerjax.microsurface import directional_albedo as by_quadrature
 from layerjax.microsurface import energy_tables as tables
-from layerjax.microsurface.splines import fitted, read
+from layerjax.microsurface.splines import fit_splines, read
 from tests.helpers.metals import conductor_energy
 
 COUNT = 2000
@@ -65,12 +65,14 @@ def test_retained_light() -> None:
     layer = np.clip(critical + 2.0 * alpha * rng.normal(size=COUNT), 1e-3, 1.0)
     cosine = np.where(rng.uniform(size=COUNT) < 0.5, cosine, layer)
     near(
-        tables.retained_share(cosine, alpha, ratio),
-        by_quadrature.retained(cosine, alpha, ratio, points=24),
+        tables.escape_cone_share(cosine, alpha, ratio),
+        by_quadrature.escape_cone_share(cosine, alpha, ratio, points=24),
         1.5e-3,
         1.2e-2,
     )
-    np.testing.assert_array_equal(tables.retained_share(jnp.asarray(0.5), jnp.asarray(0.2), jnp.array([1.0, 2.0])), 1.0)
+    np.testing.assert_array_equal(
+        tables.escape_cone_share(jnp.asarray(0.5), jnp.asarray(0.2), jnp.array([1.0, 2.0])), 1.0
+    )
 
 
 def test_derivatives_are_continuous_across_cells() -> None:
@@ -95,7 +97,7 @@ def test_derivatives_are_continuous_across_cells() -> None:
 def test_cubics_are_found_again() -> None:
     x = np.linspace(0.0, 1.0, 20)
     values = (1.0 + x[:, None] ** 3) * (2.0 - x**2)
-    coefficients = fitted(values, (7, 6)).ravel()
+    coefficients = fit_splines(values, (7, 6)).ravel()
     places = jnp.asarray(np.random.default_rng(5).uniform(size=(2, 50)))
     found = read(coefficients, 0, (7, 6), tuple(places))[0]
     np.testing.assert_allclose(found, (1.0 + places[0] ** 3) * (2.0 - places[1] ** 2), rtol=1e-10)
@@ -112,7 +114,7 @@ def test_ends_of_the_box(dtype) -> None:
         metal = tables.conductor_energies(c, a, (n,), (3.0 * n,), True)
         metal += tables.conductor_energies(c, a, (n,), (0.0 * n,), False)
         faces = (*tables.interface_energies(c, a, n, False), *tables.interface_energies(c, a, n, True))
-        return jnp.stack([*metal, *faces, tables.mirror_energy(c, a), tables.retained_share(c, a, n)])
+        return jnp.stack([*metal, *faces, tables.mirror_energy(c, a), tables.escape_cone_share(c, a, n)])
 
     found = jax.jit(jax.vmap(energies))(c, a, n)
     assert found.dtype == dtype

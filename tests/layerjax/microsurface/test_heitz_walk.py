@@ -8,9 +8,9 @@ from layerjax.directions import dot
 from layerjax.microsurface.heitz_walk import (
     escape_probability,
     facing_area,
-    height_overturned,
     meet_facet,
     next_height,
+    opposite_height,
     optical_depth,
     pass_through,
 )
@@ -46,8 +46,8 @@ def test_a_free_path_as_long_as_the_way_out_ends_at_the_top():
 
 def test_turning_the_surface_over_twice_gives_the_height_back():
     height = jnp.asarray([1e-12, 1e-3, 0.5, 0.7, 3.0, 30.0])
-    np.testing.assert_allclose(height_overturned(height_overturned(height)), height, rtol=1e-12)
-    np.testing.assert_allclose(jnp.exp(-height) + jnp.exp(-height_overturned(height)), 1.0, rtol=1e-14)
+    np.testing.assert_allclose(opposite_height(opposite_height(height)), height, rtol=1e-12)
+    np.testing.assert_allclose(jnp.exp(-height) + jnp.exp(-opposite_height(height)), 1.0, rtol=1e-14)
 
 
 def test_light_passes_straight_through_facets_between_equal_indices():
@@ -59,4 +59,4 @@ def test_light_passes_straight_through_facets_between_equal_indices():
     through, height, exists = pass_through(wi, m, jnp.ones(100), jnp.full(100, 0.2))
     assert np.all(exists)
     np.testing.assert_allclose(jnp.stack(through), jnp.stack([-wi[0], -wi[1], wi[2]]), atol=1e-12)
-    np.testing.assert_allclose(height, height_overturned(jnp.asarray(0.2)), rtol=1e-14)
+    np.testing.assert_allclose(height, opposite_height(jnp.asarray(0.2)), rtol=1e-14)

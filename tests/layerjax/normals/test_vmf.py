@@ -10,7 +10,7 @@ from layerjax.normals import vmf
 from tests.helpers.derivatives import with_slopes
 
 # compiled whole: outside `jit` every operation is a program of its own
-resultant, convolved, concentration_of = (jax.jit(f) for f in (vmf.resultant, vmf.convolved, vmf.concentration_of))
+resultant, convolve, concentration_of = (jax.jit(f) for f in (vmf.resultant, vmf.convolve, vmf.concentration_of))
 projected_area, masking = (jax.jit(f, static_argnums=2) for f in (vmf.projected_area, vmf.masking))
 hemisphere_norm, hemisphere_sample, hemisphere_density = map(
     jax.jit, (vmf.hemisphere_norm, vmf.hemisphere_sample, vmf.hemisphere_density)
@@ -66,8 +66,8 @@ def test_the_inverse_inverts(dtype, tolerance):
     # three turns one after the other, against the same in float64
     pairs = [resultant(jnp.asarray(np.roll(KAPPAS, shift), dtype)) for shift in (0, 4, 9)]
     truth = [resultant(jnp.asarray(np.roll(KAPPAS, shift))) for shift in (0, 4, 9)]
-    wanted = concentration_of(*convolved(*truth))
-    np.testing.assert_allclose(concentration_of(*convolved(*pairs)), wanted, rtol=20 * tolerance)
+    wanted = concentration_of(*convolve(*truth))
+    np.testing.assert_allclose(concentration_of(*convolve(*pairs)), wanted, rtol=20 * tolerance)
 
 
 def test_projected_area_of_the_normals_above_the_horizon():
@@ -132,7 +132,7 @@ def test_gradients_are_finite_and_right(dtype):
     names = ("masking", "paper", "draws", "area", "norm", "inverse")
 
     def values(c, k):
-        turned = vmf.convolved(vmf.resultant(k), vmf.resultant(0.5 * k))
+        turned = vmf.convolve(vmf.resultant(k), vmf.resultant(0.5 * k))
         found = (vmf.masking(c, k), vmf.masking(c, k, "paper"), sum(vmf.hemisphere_sample(k, 0.999 * c, c)))
         return jnp.stack([*found, vmf.projected_area(c, k), vmf.hemisphere_norm(k), vmf.concentration_of(*turned)])
 

@@ -10,7 +10,7 @@ import pytest
 
 import layerjax as lj
 from layerjax.precompute.learning import Schedule
-from layerjax.precompute.spongecake import bending, data, training
+from layerjax.precompute.spongecake import data, energy_correction, training
 from layerjax.precompute.spongecake import maker as spongecake
 from layerjax.tables import load
 from layerjax.transport.spongecake.lobes import BlurredSGGX, evaluate_second, second_lobe
@@ -22,7 +22,9 @@ def drawn(media, shards=3, seed=1):
     """Materials and directions as they are drawn, values made up."""
     random = np.random.default_rng(seed)
     parts = [data.draw_layers(random, media, data.SHARD)[0] for _ in range(shards)]
-    layers = data.Layers(*(np.concatenate(each) for each in zip(*(vars(p).values() for p in parts), strict=True)))
+    layers = data.LayerParameters(
+        *(np.concatenate(each) for each in zip(*(vars(p).values() for p in parts), strict=True))
+    )
     wi, wo = data.draw_directions(random, len(layers.alpha))
     values = 0.05 * random.uniform(size=wo.shape[:-1])
     return data.Samples(layers, *(array.astype(np.float32) for array in (wi, wo, values)))
@@ -141,23 +143,25 @@ def test_networks_are_packed_and_unpacked():
 
 @pytest.mark.slow
 def test_energies_are_balanced_once_and_always_the_same(tmp_path, monkeypatch):
-    monkeypatch.setattr(bending, "SHARD", 2)
-    monkeypatch.setattr(bending, "RULE", bending.Rule(nodes=4, cosines=3, azimuths=4, rounds=4))
+    monkeypatch.setattr(energy_correction, "SHARD", 2)
+    monkeypatch.setattr(energy_correction, "RULE", energy_correction.Rule(nodes=4, cosines=3, azimuths=4, rounds=4))
     nets = networks()
-    assert list(bending.make(tmp_path, 4, 1, nets, 7)) == [2, 4]
+    assert list(energy_correction.make(tmp_path, 4, 1, nets, 7)) == [2, 4]
     files = sorted(tmp_path.iterdir())
     stamps = [path.stat().st_mtime_ns for path in files]
-    before = bending.load(tmp_path, 4, 1, 7)
+    before = energy_correction.load(tmp_path, 4, 1, 7)
     files[1].unlink()
-    list(bending.make(tmp_path, 4, 1, nets, 7))
+    list(energy_correction.make(tmp_path, 4, 1, nets, 7))
     assert files[0].stat().st_mtime_ns == stamps[0]
-    again = bending.load(tmp_path, 4, 1, 7)
+    again = energy_correction.load(tmp_path, 4, 1, 7)
     for one, other in zip(jax.tree.leaves(before), jax.tree.leaves(again), strict=True):
         np.testing.assert_array_equal(one, other)
     assert again.log.shape == (4, 3 * 4)
     # log c is what coefficients of these very terms make of the directions; what they miss is told by energies
-    net, curve = bending.train(1, again, 3, Schedule(epochs=150, batch=4, checkpoints=150), None, lambda line: None)
-    assert np.max(np.abs(bending.errors(net, again))) < 0.2 * np.max(np.abs(again.energy * again.log))
+    net, curve = energy_correction.train(
+        1, again, 3, Schedule(epochs=150, batch=4, checkpoints=150), None, lambda line: None
+    )
+    assert np.max(np.abs(energy_correction.errors(net, again))) < 0.2 * np.max(np.abs(again.energy * again.log))
     assert curve[-1] < curve[0]
 
 
@@ -170,12 +174,12 @@ def test_what_is_learned_from_is_never_tested_with(monkeypatch):
         raise InterruptedError
 
     monkeypatch.setattr(data, "draw_layers", stop)
-    monkeypatch.setattr(bending, "draw_layers", stop)
+    monkeypatch.setattr(energy_correction, "draw_layers", stop)
     for number in range(2):
         for drawn in (
             lambda number: data.shard(number, 1, "train", 7),
             lambda number: data.shard(number, 1, "test", 7),
-            lambda number: bending.shard(number, 1, {}, 7),
+            lambda number: energy_correction.shard(number, 1, {}, 7),
         ):
             with pytest.raises(InterruptedError):
                 drawn(number)

@@ -13,7 +13,7 @@ ABSORBS, SCATTERS = lj.Medium(0.4, 0.0), lj.Medium(0.4, 0.5)
 FACE, BASE = lj.Interface(1.5, 0.3), lj.Lambertian(0.8)
 
 
-def chosen_for(stack):
+def choose(stack):
     return automatic(stack, simplify(stack))
 
 
@@ -34,12 +34,12 @@ def chosen_for(stack):
     ],
 )
 def test_rule(stack, expected):
-    assert type(chosen_for(stack)) is expected
+    assert type(choose(stack)) is expected
 
 
 def test_an_albedo_that_is_not_known_may_scatter():
     def chosen(albedo):
-        assert isinstance(chosen_for(lj.Stack([FACE, lj.Medium(0.4, albedo)], BASE)), lj.AddingDoubling)
+        assert isinstance(choose(lj.Stack([FACE, lj.Medium(0.4, albedo)], BASE)), lj.AddingDoubling)
 
     jax.eval_shape(chosen, 0.0)
 

@@ -224,7 +224,7 @@ def test_tolerance_picks_the_resolution(stack, tolerance):
 @pytest.mark.parametrize(("nodes", "compared"), [(2, [(3, 2)]), (3, [(2, 1), (4, 2)])])
 def test_errors_are_told_by_other_resolutions(nodes, compared):
     """The coarser one, if there is one, and the finer."""
-    found = lj.AddingDoubling(nodes=nodes, modes=1, ordinates=(2, 4)).compared()
+    found = lj.AddingDoubling(nodes=nodes, modes=1, ordinates=(2, 4)).comparison_transports()
     assert [(one.nodes, one.modes) for one in found] == compared
 
 
@@ -232,7 +232,7 @@ def test_errors_are_told_by_other_resolutions(nodes, compared):
 def test_a_tolerance_is_not_reached_by_what_shines_beside(monkeypatch):
     """Next to a peak that is known in closed form any error of the rest is small: that counts by itself."""
     monkeypatch.setattr(
-        "layerjax.transport.adding_doubling.transport.rungs",
+        "layerjax.transport.adding_doubling.transport.resolutions",
         lambda stack: [Resolution(2, 1, (2, 4)), Resolution(3, 2, (2, 4))],
     )
     stack = Stack([Medium(1e-3, 0.9, lj.SGGX("surface", 0.05))])

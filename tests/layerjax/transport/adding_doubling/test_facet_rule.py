@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy import special
 
-from layerjax.transport.adding_doubling.facet_light import ENERGY_POINTS, Normals, facet_energies, refracted_rays
+from layerjax.transport.adding_doubling.facet_scattering import ENERGY_POINTS, Normals, facet_energies, refracted_rays
 from layerjax.transport.adding_doubling.grid import Region
 
 

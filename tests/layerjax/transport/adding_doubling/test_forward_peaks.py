@@ -14,7 +14,7 @@ import layerjax as lj
 from layerjax.phase.moments import moments_by_quadrature
 from layerjax.transport.adding_doubling.grid import make_grid
 from layerjax.transport.adding_doubling.media import kernel_modes
-from layerjax.transport.adding_doubling.moments import Terms
+from layerjax.transport.adding_doubling.moments import MomentCounts
 
 WI = lj.direction(np.deg2rad(20.0), 0.0)
 THROUGH = lj.direction(np.pi - np.deg2rad([3.0, 60.0, 75.0]), np.pi)
@@ -80,7 +80,9 @@ def test_the_kernel_is_the_phase_function_at_the_nodes(dtype, rounding):
     With Schlick's factor there is a cusp straight on, of which 240 moments lack what such a rule lacks as well.
     """
     region = make_grid([1.0], (0,), 4, dtype).regions[0]
-    kernel = jax.jit(lambda g: kernel_modes(lj.HenyeyGreenstein(g), True, region, 200, Terms(240, 240)))(dtype(0.6))
+    kernel = jax.jit(lambda g: kernel_modes(lj.HenyeyGreenstein(g), True, region, 200, MomentCounts(240, 240)))(
+        dtype(0.6)
+    )
     phi = 2.0 * np.pi * np.arange(600) / 600
     mu, sine = (np.asarray(part, float) for part in (region.cosine, region.sine))
     for side, plain, fifth in zip((-1.0, 1.0), kernel.plain, kernel.schlick, strict=True):

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import layerjax as lj
-from layerjax.transport.adding_doubling.resolution import ORDINATES_LADDER, Resolution, chosen, rungs
+from layerjax.transport.adding_doubling.resolution import ORDINATES, Resolution, choose_resolution, resolutions
 
 FACE, PAINT = lj.Interface(1.5, 0.05), lj.Lambertian(0.5)
 HAZE = lj.Medium(1.0, 0.9, lj.HenyeyGreenstein(0.9))
@@ -37,21 +37,23 @@ def flakes(alpha):
     ],
 )
 def test_narrow_lobes_behind_others_decide(stack, followed, least):
-    found = chosen(lj.stack.simplify(stack), followed)
+    found = choose_resolution(lj.stack.simplify(stack), followed)
     assert least <= found.nodes <= max(least, 4 * least // 3)
     assert found.modes >= found.nodes // 2
 
 
 def test_bare_media_need_modes_rather_than_nodes():
     """Light inclined to grazing sees lobes that are narrow in azimuth; a varnish keeps it away from there."""
-    bare, coated = (chosen(lj.Stack([*above, flakes(0.2)], PAINT), followed=False) for above in ((), (FACE,)))
+    bare, coated = (
+        choose_resolution(lj.Stack([*above, flakes(0.2)], PAINT), directions_known=False) for above in ((), (FACE,))
+    )
     assert bare.nodes == coated.nodes
     assert bare.modes > 2 * coated.modes
 
 
 def test_traced_lobes_count_as_rather_narrow():
     def nodes(alpha):
-        return chosen(lj.Stack([FACE], lj.Conductor(0.4, 3.0, alpha)), followed=True).nodes
+        return choose_resolution(lj.Stack([FACE], lj.Conductor(0.4, 3.0, alpha)), directions_known=True).nodes
 
     seen = []
     jax.eval_shape(lambda alpha: seen.append(nodes(alpha)) or alpha, 0.5)
@@ -74,12 +76,12 @@ def test_what_is_chosen_is_told_and_what_is_given_stays():
 
 
 def test_neighbours_are_coarser_and_finer():
-    for resolution in rungs(lj.Stack([FACE, HAZE], PAINT)):
+    for resolution in resolutions(lj.Stack([FACE, HAZE], PAINT)):
         coarse, fine = resolution.coarser(), resolution.finer()
         assert coarse.nodes < resolution.nodes < fine.nodes
         assert coarse.modes < resolution.modes < fine.modes
-    ordinates = [resolution.ordinates for resolution in rungs(lj.Stack([FIBERS]))]
-    assert tuple(ordinates) == ORDINATES_LADDER
+    ordinates = [resolution.ordinates for resolution in resolutions(lj.Stack([FIBERS]))]
+    assert tuple(ordinates) == ORDINATES
     assert Resolution(2, 1, (2, 4)).coarser() == Resolution(2, 1, (2, 4))
 
 

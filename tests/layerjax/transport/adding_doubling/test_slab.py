@@ -55,7 +55,7 @@ def equations(albedo, g, modes=2):
     kernel = media.kernel_modes(lj.HenyeyGreenstein(g), False, region, modes, terms(NODES, False))
     rate = jnp.sqrt(2.0 * jnp.pi * kernel.solid / kernel.cosine)
     back, onward = (albedo * rate[:, None] * part * rate for part in kernel.plain)
-    area = kernel.area if kernel.onward is None else kernel.area - albedo * kernel.onward[0]
+    area = kernel.area if kernel.ballistic is None else kernel.area - albedo * kernel.ballistic[0]
     removed = jnp.diag(area / kernel.cosine)
     return np.asarray(removed - onward + back), np.asarray(removed - onward - back)
 
@@ -137,7 +137,7 @@ def test_decomposed_together_as_on_a_gpu(monkeypatch):
 
     one_by_one = jax.jit(program())(primals, tangents)
     assert "custom_vmap" in str(jax.make_jaxpr(slab)(*primals))
-    monkeypatch.setattr("layerjax.transport.adding_doubling.slab.room", lambda: 2)
+    monkeypatch.setattr("layerjax.transport.adding_doubling.slab.chunk_factor", lambda: 2)
     assert "custom_vmap" not in str(jax.make_jaxpr(lambda *given: slab(*given))(*primals))
     together = jax.jit(program())(primals, tangents)
     for found, expected in zip(jax.tree.leaves(together), jax.tree.leaves(one_by_one), strict=True):
@@ -150,7 +150,7 @@ FIBERS = lj.SGGX("fiber", 0.4, (0.5, 0.3, 0.8))
 @eqx.filter_jit
 def layer(medium, doubled):
     region = make_grid([1.0], (0,), 4, medium.thickness.dtype).regions[0]
-    if medium.phase.is_upright:
+    if medium.phase.is_axisymmetric:
         kernel = media.kernel_modes(medium.phase, False, region, 4, terms(4, False))
     else:
         kernel = media.kernel_ordinates(medium.phase, False, region, 8)

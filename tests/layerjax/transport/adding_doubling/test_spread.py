@@ -7,7 +7,7 @@ import pytest
 from scipy import integrate
 
 import layerjax as lj
-from layerjax.transport.adding_doubling.grid import make_grid, spread
+from layerjax.transport.adding_doubling.grid import interpolation_weights, make_grid
 
 NODES = 12
 GRID = make_grid((1.0, 1.5, 1.3), (0, 2, 1), NODES, jnp.float64)
@@ -17,7 +17,7 @@ IOR = GRID.regions[1].ior
 def weights(squared: np.ndarray, blur: float) -> np.ndarray:
     """Of directions in the region of index 1.5, told by s^2."""
     sine2 = jnp.asarray(squared) / IOR**2
-    return np.asarray(spread(GRID, IOR, jnp.sqrt(1.0 - sine2), sine2, blur * jnp.ones_like(GRID.edges)))
+    return np.asarray(interpolation_weights(GRID, IOR, jnp.sqrt(1.0 - sine2), sine2, blur * jnp.ones_like(GRID.edges)))
 
 
 @pytest.mark.parametrize("blur", [0.0, 1e-6, 0.05])
@@ -30,7 +30,7 @@ def test_weights_sum_to_one(blur: float) -> None:
 def test_nodes_go_to_nodes(region: int) -> None:
     """Where nothing is blurred, in every region; what does not exist there has no weight."""
     here = GRID.regions[region]
-    found = np.asarray(spread(GRID, here.ior, here.cosine, here.sine**2, jnp.zeros_like(GRID.edges)))
+    found = np.asarray(interpolation_weights(GRID, here.ior, here.cosine, here.sine**2, jnp.zeros_like(GRID.edges)))
     exists = np.asarray(here.exists)
     np.testing.assert_allclose(found[exists], np.eye(GRID.size)[exists], atol=1e-9)
     assert not found[exists][:, ~exists].any()

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import layerjax as lj
-from layerjax._known import known_values
+from layerjax._concrete import concrete_values
 from tests.helpers.random_stacks import STRUCTURES, drawn, lengths
 
 WI = lj.direction(np.radians(20.0), 0.0)
@@ -108,8 +108,8 @@ def test_what_is_known_under_transformations():
     seen = []
 
     def look(number):
-        seen.append(known_values(lj.Interface(1.5, number).alpha))
-        seen.append(known_values(lj.Interface(number, 0.25).alpha))
+        seen.append(concrete_values(lj.Interface(1.5, number).alpha))
+        seen.append(concrete_values(lj.Interface(number, 0.25).alpha))
         return number
 
     jax.grad(look)(0.5)
@@ -123,7 +123,7 @@ def test_what_is_known_under_transformations():
 
 def test_directions_written_into_a_program_stay_known():
     seen = []
-    jax.jit(lambda one: seen.append(known_values(lj.direction(0.5, 0.0))) or one)(1.0)
+    jax.jit(lambda one: seen.append(concrete_values(lj.direction(0.5, 0.0))) or one)(1.0)
     assert seen[0] is not None
 
 

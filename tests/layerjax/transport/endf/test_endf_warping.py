@@ -102,10 +102,10 @@ BEAMS, FACETS = np.array([50.0, 100.0, 200.0]), np.array([200.0, 100.0, 50.0])
 
 @jax.jit
 def examples(beam, facets, cosine, ior):
-    reflected, refracted = warping.reflected(beam, facets, cosine), warping.refracted(beam, facets, cosine, ior)
+    reflected, refracted = warping.reflect_beam(beam, facets, cosine), warping.refract_beam(beam, facets, cosine, ior)
     extended = (
-        warping.extended(reflected, warping.reflection_gains(cosine)),
-        warping.extended(refracted, warping.refraction_gains(cosine, ior)),
+        warping.extended_concentration(reflected, warping.reflection_gains(cosine)),
+        warping.extended_concentration(refracted, warping.refraction_gains(cosine, ior)),
     )
     exact = warping.reflected_moment(beam, facets, cosine), warping.refraction_trace(beam, facets, cosine, ior)
     return (reflected, refracted), extended, exact

@@ -1,4 +1,4 @@
-"""The generator of the walk: uniform, independent between draws and between lanes, the same for the same key."""
+"""The generator of the walk: uniform, independent between draws and between walkers, the same for the same key."""
 
 import jax
 import jax.numpy as jnp
@@ -11,13 +11,13 @@ from layerjax.transport.random_walk.random_numbers import circle, key_words, pcg
 SIGNIFICANCE = 1e-4
 
 
-def stream(seed, lanes, draws, blocks=1, dtype=np.float64):
-    """Numbers of shape (draws, 4 blocks, lanes)."""
+def stream(seed, walkers, draws, blocks=1, dtype=np.float64):
+    """Numbers of shape (draws, 4 blocks, walkers)."""
     words = key_words(jax.random.key(seed))
-    lane = jnp.arange(lanes, dtype=jnp.uint32)
+    walker = jnp.arange(walkers, dtype=jnp.uint32)
 
     def one(counter):
-        return jnp.stack(uniforms(counter, lane, words, blocks, jnp.dtype(dtype)))
+        return jnp.stack(uniforms(counter, walker, words, blocks, jnp.dtype(dtype)))
 
     return np.asarray(jax.lax.map(one, jnp.arange(draws, dtype=jnp.uint32)))
 
@@ -52,9 +52,9 @@ def test_uniform_and_independent(blocks):
     pairs(u[:, 0], u[:, 1])  # numbers of one draw
     pairs(u[:, -2], u[:, -1])
     pairs(u[:-1, -1], u[1:, 0])  # the next draw
-    for shift in (1, 2, 256):  # other lanes
+    for shift in (1, 2, 256):  # other walkers
         pairs(u[..., :-shift], u[..., shift:])
-    # every lane and every draw has the right mean: none is stuck
+    # every walker and every draw has the right mean: none is stuck
     for axis in (0, 2):
         mean = u.mean(axis=(axis, 1))
         z = (mean - 0.5) * np.sqrt(12 * u.shape[axis] * u.shape[1])

@@ -176,10 +176,10 @@ def transmittance_of_isotropic_slab(thickness, cells=1000):
 def test_a_naive_stop_is_biased_and_this_one_is_not():
     # what takes long gets lost if the walk stops after a number of steps and counts what is done
     assert abs(transmittance_of_isotropic_slab(1.0) - 0.65867) < 1e-5  # van de Hulst 1980
-    stack, lanes, paths = lj.Stack([haze(0.0, 10.0)]), 4096, 16
+    stack, walkers, paths = lj.Stack([haze(0.0, 10.0)]), 4096, 16
     scene = Scene(stack, 1, jnp.dtype(jnp.float64))
-    wi = tuple(jnp.full(lanes, component) for component in lj.direction(0.0, 0.0))
-    words, index = key_words(KEY), jnp.arange(lanes, dtype=jnp.uint32)
+    wi = tuple(jnp.full(walkers, component) for component in lj.direction(0.0, 0.0))
+    words, index = key_words(KEY), jnp.arange(walkers, dtype=jnp.uint32)
 
     def record(total, step, owes):
         full, naive, steps = total
@@ -190,8 +190,8 @@ def test_a_naive_stop_is_biased_and_this_one_is_not():
     zero = jnp.zeros(2, jnp.int64)
     start = (zero, zero, jnp.int32(0))
     walk = Walk(scene, wi, None, False)
-    full, naive, _ = follow(walk, record, start, index, jnp.full(lanes, paths), words, jnp.dtype(jnp.float64))
-    assert full[0] == lanes * paths  # each path that was owed, no other
+    full, naive, _ = follow(walk, record, start, index, jnp.full(walkers, paths), words, jnp.dtype(jnp.float64))
+    assert full[0] == walkers * paths  # each path that was owed, no other
     expected = transmittance_of_isotropic_slab(10.0)
 
     def z(counts):

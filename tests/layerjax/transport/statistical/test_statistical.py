@@ -7,7 +7,7 @@ import pytest
 
 import layerjax as lj
 from layerjax.transport.statistical.lobes import Options, lobe_roughness, statistics
-from layerjax.transport.statistical.shaped import shaped
+from layerjax.transport.statistical.microfacet_lobes import microfacet_lobes
 from layerjax.transport.statistical.variance import phase_variance, roughness
 from tests.helpers.compiled import compiled
 from tests.helpers.sampling import chi_square
@@ -83,7 +83,7 @@ def test_haze_behind_an_index_spreads_transmitted_light_alike_from_either_side()
     stack, cosine = lj.Stack([lj.Interface(1.5, 1e-4), lj.Medium(0.5, 1.0, lj.HenyeyGreenstein(0.9))]), jnp.ones(())
     options = Options(True, "orders", angles=False, own_side=False)
     for upward in (False, True):
-        once = shaped(stack, options, cosine, upward).transmitted[1].alpha[0]
+        once = microfacet_lobes(stack, options, cosine, upward).transmitted[1].alpha[0]
         np.testing.assert_allclose(once, roughness(phase_variance(jnp.asarray(0.9))), rtol=1e-3)
 
 

@@ -7,7 +7,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from layerjax.transport.statistical.adding import Element, Orders, add_element, nothing, plus, retain, times, whole
+from layerjax.transport.statistical.adding import (
+    Element,
+    Orders,
+    add_element,
+    add_orders,
+    identity,
+    limit_escape,
+    multiply_orders,
+    sum_orders,
+)
 from layerjax.transport.statistical.variance import (
     bounded_refracted_cosine,
     phase_variance,
@@ -59,7 +68,7 @@ def by_orders(energies: Sequence[float]) -> Orders:
 
 
 def total(energy: Orders) -> float:
-    return float(whole(energy)[0])
+    return float(sum_orders(energy)[0])
 
 
 def random_elements(seed: int, count: int, orders: int = 1) -> list[Element]:
@@ -109,7 +118,7 @@ def paths(elements: list[Element]) -> tuple[float, float, float, float]:
 @pytest.mark.parametrize("seed", [*(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2)), 3])
 def test_adding_is_the_sum_over_paths(seed: int) -> None:
     elements = random_elements(seed, 4)
-    above, lobes = nothing(jnp.ones(())), []
+    above, lobes = identity(jnp.ones(())), []
     for element in elements:
         lobe, above = add_element(above, element)
         lobes.append(lobe)
@@ -123,7 +132,7 @@ def test_adding_is_the_sum_over_paths(seed: int) -> None:
 def test_scattering_orders_sum_to_the_whole() -> None:
     """Whatever the orders are, their sums follow the same adding; and the first two are those of a power series."""
     elements = random_elements(4, 3, orders=3)
-    above, reflected = nothing(jnp.ones(())), 0.0
+    above, reflected = identity(jnp.ones(())), 0.0
     for element in elements:
         lobe, above = add_element(above, element)
         reflected += total(lobe.energy)
@@ -140,7 +149,7 @@ def test_scattering_orders_sum_to_the_whole() -> None:
             )
             for e in elements
         ]
-        state = nothing(jnp.ones(()))
+        state = identity(jnp.ones(()))
         for element in scaled:
             found, state = add_element(state, element)
         return total(found.energy)
@@ -152,13 +161,13 @@ def test_scattering_orders_sum_to_the_whole() -> None:
 
 def test_products_of_orders_keep_sums_and_padding() -> None:
     a, b = by_orders([0.5, 0.2, 0.1]), by_orders([0.3, 0.3, 0.4])
-    np.testing.assert_allclose(np.ravel(times(a, b)), [0.15, 0.21, 0.44])
-    np.testing.assert_allclose(np.ravel(plus(a, b[:1])), [0.8, 0.2, 0.1])
-    np.testing.assert_allclose(np.ravel(times(a, b[:1])), 0.3 * np.ravel(a))
+    np.testing.assert_allclose(np.ravel(multiply_orders(a, b)), [0.15, 0.21, 0.44])
+    np.testing.assert_allclose(np.ravel(add_orders(a, b[:1])), [0.8, 0.2, 0.1])
+    np.testing.assert_allclose(np.ravel(multiply_orders(a, b[:1])), 0.3 * np.ravel(a))
 
 
 def test_total_reflection_keeps_the_energy() -> None:
-    _, above = add_element(nothing(jnp.ones(())), random_elements(5, 1)[0])
-    kept = retain(above, (jnp.asarray(0.7),))
+    _, above = add_element(identity(jnp.ones(())), random_elements(5, 1)[0])
+    kept = limit_escape(above, (jnp.asarray(0.7),))
     np.testing.assert_allclose(np.ravel(kept.ti), 0.7 * np.ravel(above.ti))
-    np.testing.assert_allclose(np.ravel(plus(kept.ti, kept.ri)), np.ravel(plus(above.ti, above.ri)))
+    np.testing.assert_allclose(np.ravel(add_orders(kept.ti, kept.ri)), np.ravel(add_orders(above.ti, above.ri)))

@@ -183,8 +183,8 @@ def test_packing_keeps_the_matrices() -> None:
     random = np.random.default_rng(1)
     entries = jnp.asarray(random.normal(size=(3, streams.ENTRIES)))
     dense = jnp.asarray([1.0, 1.5, 4.0])
-    inward, outer, inner = map(np.asarray, streams.unpacked(entries, dense))
-    np.testing.assert_allclose(streams.packed(inward, outer, inner), entries, atol=1e-15)
+    inward, outer, inner = map(np.asarray, streams.unpack(entries, dense))
+    np.testing.assert_allclose(streams.pack(inward, outer, inner), entries, atol=1e-15)
     for reflected in (outer, inner):
         np.testing.assert_allclose(reflected, np.swapaxes(reflected, -1, -2), atol=1e-12)
     first = np.eye(streams.STREAMS)[0]
@@ -199,7 +199,7 @@ def test_interfaces_are_as_their_quadrature() -> None:
     random = np.random.default_rng(0)
     alpha, ior = np.exp(random.uniform(np.log(1e-4), 0.0, 30)), np.exp(random.uniform(0.0, np.log(4.0), 30))
     inward, outward = diffuse_moments(alpha, ior), diffuse_moments(alpha, 1.0 / ior)
-    found = streams.face(jnp.asarray(alpha), jnp.asarray(ior))
+    found = streams.interface_matrices(jnp.asarray(alpha), jnp.asarray(ior))
     wanted = (
         (found.down, inward.through + _rest(outward.later, inward.later)),
         (found.top, inward.back + _rest(inward.returned, inward.returned)),

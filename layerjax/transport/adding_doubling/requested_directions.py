@@ -22,13 +22,13 @@ from layerjax.transport.known_directions import KnownDirections
 class RequestedValues(eqx.Module):
     """f of the paths with more than one event between known directions.
 
-    values: (out, in, channels, modes), over the cosines above, and if light passes those below. of_wi, of_wo: see
+    values: (out, in, channels, modes), over the cosines above, and if light passes those below. wi_index, wo_index: see
     `KnownDirections`.
     """
 
     values: Array
-    of_wi: Array
-    of_wo: Array
+    wi_index: Array
+    wo_index: Array
     opaque: bool = eqx.field(static=True)
 
 
@@ -54,7 +54,7 @@ def requested_values(whole: Layer, known: KnownDirections, bottom: Array, opaque
         lower = [whole_block(block, below, size) for block, size in zip(rows[1], (above, below), strict=True)]
         full = jnp.concatenate([full, bottom**2 * jnp.concatenate(lower, axis=-1)], axis=-2)
     values = jnp.transpose(full, (2, 3, 0, 1)) / (2.0 * jnp.pi)
-    return RequestedValues(values, known.of_wi, known.of_wo, opaque)
+    return RequestedValues(values, known.wi_index, known.wo_index, opaque)
 
 
 def read_requested(solved: RequestedValues, wi: Vector, wo: Vector, side: Side) -> Channels:
@@ -67,7 +67,7 @@ def read_requested(solved: RequestedValues, wi: Vector, wo: Vector, side: Side) 
         if side == "transmission":
             valid = valid & (z_i * z_o < 0)
     last = solved.values.shape[0] - 1
-    out, into = jnp.minimum(solved.of_wo, last), jnp.minimum(solved.of_wi, last)
+    out, into = jnp.minimum(solved.wo_index, last), jnp.minimum(solved.wi_index, last)
     modes = np.arange(solved.values.shape[-1])
     series = solved.values[out, into]
     waves = jnp.where(modes == 0, 1.0, 2.0) * jnp.cos(turn(wi, wo)[..., None] * modes)

@@ -12,31 +12,31 @@ import numpy as np
 
 from layerjax._parameters import takes_several
 
-MOST_SHOWN = 8
+MOST_LISTED = 8
 """Numbers that are named one by one; of more, shape and range are shown."""
 
 
-CALLED_HERE = {"roughness": "alpha", "eta": "ior", "n": "ior", "kappa": "k", "depth": "thickness", "tau": "thickness"}
+SYNONYMS = {"roughness": "alpha", "eta": "ior", "n": "ior", "kappa": "k", "depth": "thickness", "tau": "thickness"}
 """Arguments by what they are called elsewhere."""
 
 
-class Shown(eqx.Module):
+class ReprModule(eqx.Module):
     """A module that is shown as the call that makes it, and whose arguments are named where one is unknown."""
 
     def __new__(cls, *_: Any, **fields: Any) -> Self:
         known = [] if not fields else [*inspect.signature(cls.__init__).parameters][1:]
         for name in fields:
             if name not in known:
-                meant = CALLED_HERE.get(name)
+                meant = SYNONYMS.get(name)
                 hint = f" ({meant}?)" if meant in known else ""
                 raise TypeError(f"{cls.__name__}: unknown argument {name!r}{hint}; it takes {', '.join(known)}")
         return super().__new__(cls)
 
     def __repr__(self) -> str:
-        return as_call(self)
+        return format_call(self)
 
 
-def as_call(owner: Any) -> str:
+def format_call(owner: Any) -> str:
     """``Interface(ior=1.5, alpha=0.3)``, on one line, without the fields that have their default.
 
     Single numbers and few channels have all their digits, so that the words make the same again. Of a map shape and
@@ -45,7 +45,7 @@ def as_call(owner: Any) -> str:
     words = []
     for field in dataclasses.fields(owner):
         if field.repr and hasattr(owner, field.name):  # one that a constructor has refused may lack fields
-            word = in_words(getattr(owner, field.name))
+            word = format_value(getattr(owner, field.name))
             if word.startswith("[") and not takes_several(f"{type(owner).__name__}.{field.name}"):
                 word = f"array({word})"  # of a map: lists are for channels
             if word != _default(field):
@@ -53,37 +53,37 @@ def as_call(owner: Any) -> str:
     return f"{type(owner).__name__}({', '.join(words)})"
 
 
-def described(owner: Any, digits: int = 4) -> str:
+def describe(owner: Any, digits: int = 4) -> str:
     """The same for reading: ``ior 1.5, alpha 0.3``, without the name of the class, rounded to so many digits."""
-    return ", ".join(_described(owner, digits)) if dataclasses.is_dataclass(owner) else ""
+    return ", ".join(_describe_fields(owner, digits)) if dataclasses.is_dataclass(owner) else ""
 
 
-def _described(owner: Any, digits: int) -> Iterator[str]:
+def _describe_fields(owner: Any, digits: int) -> Iterator[str]:
     for field in dataclasses.fields(owner):
         value = getattr(owner, field.name)
-        if in_words(value) == _default(field):
+        if format_value(value) == _default(field):
             continue
-        if isinstance(value, Shown):
-            inner = described(value, digits)
+        if isinstance(value, ReprModule):
+            inner = describe(value, digits)
             yield f"{field.name} {type(value).__name__}{f' ({inner})' if inner else ''}"
         else:
-            yield value if isinstance(value, str) else f"{field.name} {in_words(value, digits)}"
+            yield value if isinstance(value, str) else f"{field.name} {format_value(value, digits)}"
 
 
-def in_words(value: Any, digits: int | None = None) -> str:
+def format_value(value: Any, digits: int | None = None) -> str:
     """A value of a field on one line; numbers with all their digits, or so many."""
     if isinstance(value, list | tuple):
-        return f"[{', '.join(in_words(entry, digits) for entry in value)}]"
+        return f"[{', '.join(format_value(entry, digits) for entry in value)}]"
     if isinstance(value, Mapping):
-        return f"{{{', '.join(f'{key!r}: {in_words(entry, digits)}' for key, entry in value.items())}}}"
-    if _is_known(value):
-        return _number_words(np.asarray(value), digits)
+        return f"{{{', '.join(f'{key!r}: {format_value(entry, digits)}' for key, entry in value.items())}}}"
+    if _is_concrete(value):
+        return _format_numbers(np.asarray(value), digits)
     if hasattr(value, "shape") and hasattr(value, "dtype"):  # traced, or a shape alone
         return eqx.tree_pformat(value)
     return " ".join(repr(value).split())
 
 
-def _is_known(value: Any) -> bool:
+def _is_concrete(value: Any) -> bool:
     """Whether these are numbers, or one, with values that can be read."""
     if isinstance(value, bool) or not isinstance(value, int | float | np.number | np.ndarray | jax.Array):
         return False
@@ -93,14 +93,14 @@ def _is_known(value: Any) -> bool:
     return np.size(value) > 0 and (jnp.issubdtype(dtype, jnp.floating) or jnp.issubdtype(dtype, jnp.integer))
 
 
-def _number_words(numbers: np.ndarray, digits: int | None) -> str:
+def _format_numbers(numbers: np.ndarray, digits: int | None) -> str:
     def word(number: Any) -> str:
         # the shortest that makes this number again in its own precision, as Python writes it
         return repr(float(str(number))) if digits is None else f"{float(number):.{digits}g}"
 
     if numbers.ndim == 0:
         return word(numbers[()])
-    if numbers.ndim == 1 and numbers.size <= MOST_SHOWN:
+    if numbers.ndim == 1 and numbers.size <= MOST_LISTED:
         return f"[{', '.join(map(word, numbers))}]"
     shape = " x ".join(map(str, numbers.shape))
     low, high = (f"{float(end):.4g}" for end in (numbers.min(), numbers.max()))
@@ -110,8 +110,8 @@ def _number_words(numbers: np.ndarray, digits: int | None) -> str:
 def _default(field: Any) -> str | None:
     """What is shown of the field's default; None if it has none."""
     if field.default is not dataclasses.MISSING:
-        return in_words(field.default)
+        return format_value(field.default)
     if field.default_factory is dataclasses.MISSING:
         return None
     with jax.ensure_compile_time_eval():  # nothing of it becomes part of a program that is being traced
-        return in_words(field.default_factory())
+        return format_value(field.default_factory())

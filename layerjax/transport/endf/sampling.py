@@ -13,11 +13,11 @@ import jax.numpy as jnp
 from jax import Array
 
 from layerjax import channels, fresnel
-from layerjax._numerics import at_most, safe_sqrt
+from layerjax._numerics import clamp_max, safe_sqrt
 from layerjax.channels import Channels, mean, total
-from layerjax.directions import Vector, flip, half_vector, is_above, reflect, refract, sanitised, select
+from layerjax.directions import Vector, flip, half_vector, is_above, reflect, refract, sanitise, select
 from layerjax.normals import facets
-from layerjax.normals.facet_rule import parallels, polar_angles, seen_facets
+from layerjax.normals.facet_rule import parallels, polar_angles, visible_normals
 from layerjax.quadrature import Nodes
 from layerjax.surfaces.interface import interface_pdf, interface_reflection, interface_sample, interface_transmission
 from layerjax.surfaces.lambertian import sample_cosine
@@ -25,13 +25,13 @@ from layerjax.transport.endf.chains import (
     Coat,
     Options,
     UpperSide,
-    absorbed,
     chain_concentration,
-    entered,
     inner_concentration,
-    masked,
+    masking_over_cosine,
     reflections,
-    visible,
+    refract_in,
+    smith_masking,
+    transmittance,
     width,
 )
 from layerjax.transport.endf.slab import inner_slab_concentration, slab_concentration, transmissions
@@ -60,14 +60,14 @@ def _proposals(coat: Coat, options: Options, wi: Vector, opaque: bool) -> list[P
     """One for each of the lobes, in their order: of `reflections`, then of `transmissions`."""
     top, base = coat.top, coat.base
     if top is None:
-        return [] if base is None else _shared([Proposal(jnp.ones_like(wi[2]), base.kappa, "outside", False)])
+        return [] if base is None else _normalise_shares([Proposal(jnp.ones_like(wi[2]), base.kappa, "outside", False)])
     level = fresnel.dielectric(wi[2], top.ior)
     found = [Proposal(level, top.kappa, "outside", False)]
     if base is None:
-        return _shared(found)
-    inner, enters = entered(wi, top.ior)
+        return _normalise_shares(found)
+    inner, enters = refract_in(wi, top.ior)
     through = jnp.where(enters, (1.0 - level) ** 2, 0.0)
-    kept = mean(base.reflectance(inner[2])), mean(absorbed(coat, inner, (-inner[0], -inner[1], inner[2])))
+    kept = mean(base.reflectance(inner[2])), mean(transmittance(coat, inner, (-inner[0], -inner[1], inner[2])))
     outside = options.form == "paper"
     place: Place = "outside" if outside else "inside"
     energy = through * kept[0] * kept[1]
@@ -76,18 +76,18 @@ def _proposals(coat: Coat, options: Options, wi: Vector, opaque: bool) -> list[P
         found.append(Proposal(energy, kappa, place, False))
         energy = energy * level * kept[0] * kept[1]
     if opaque:
-        return _shared(found)
-    energy = through * mean(absorbed(coat, inner, inner, 0.5))
+        return _normalise_shares(found)
+    energy = through * mean(transmittance(coat, inner, inner, 0.5))
     for j in range(options.bounces + 1):
         kappa = slab_concentration(j, wi[2], top, base)
         if not outside:
             kappa = inner_slab_concentration(j, inner[2], top, base)
         found.append(Proposal(energy, kappa, place, True))
         energy = energy * level * kept[0] * kept[1]
-    return _shared(found)
+    return _normalise_shares(found)
 
 
-def _shared(lobes: list[Proposal]) -> list[Proposal]:
+def _normalise_shares(lobes: list[Proposal]) -> list[Proposal]:
     total = sum((lobe.share + LEAST_SHARE for lobe in lobes[1:]), lobes[0].share + LEAST_SHARE)
     return [lobe._replace(share=(1.0 - COSINE) * (lobe.share + LEAST_SHARE) / total) for lobe in lobes]
 
@@ -95,22 +95,24 @@ def _shared(lobes: list[Proposal]) -> list[Proposal]:
 def draw(coat: Coat, options: Options, wi: Vector, uniforms: tuple[Array, Array, Array], opaque: bool) -> Vector:
     """Outgoing directions for wi above, from three uniform numbers each."""
     u, u1, u2 = uniforms
-    wi = sanitised(wi)
+    wi = sanitise(wi)
     x, y, z = sample_cosine(u1, u2)
     by_cosine: Vector = (x, y, z if opaque else jnp.where(u < 1.0 - 0.5 * COSINE, z, -z))
     if _is_interface(coat):
         assert coat.top is not None
-        again = at_most(u / (1.0 - COSINE), BELOW_ONE)
+        again = clamp_max(u / (1.0 - COSINE), BELOW_ONE)
         wo, leaves = interface_sample(wi, coat.top.ior, width(coat.top.kappa), u1, u2, again, "vmf")
     else:
         lobes = _proposals(coat, options, wi, opaque)
         if not lobes:
             return by_cosine
-        wo, leaves = _reflected(coat, wi, lobes, u, u1, u2)
+        wo, leaves = _sample_reflection(coat, wi, lobes, u, u1, u2)
     return select(u < 1.0 - COSINE, (wo[0], wo[1], jnp.where(leaves, wo[2], 0.0)), by_cosine)
 
 
-def _reflected(coat: Coat, wi: Vector, lobes: list[Proposal], u: Array, u1: Array, u2: Array) -> tuple[Vector, Array]:
+def _sample_reflection(
+    coat: Coat, wi: Vector, lobes: list[Proposal], u: Array, u1: Array, u2: Array
+) -> tuple[Vector, Array]:
     """Direction drawn from the lobe that u falls to, and whether light leaves along it."""
     kappa, inside, through = lobes[0].kappa, jnp.zeros_like(u, bool), jnp.zeros_like(u, bool)
     edge = jnp.zeros_like(u)
@@ -124,13 +126,13 @@ def _reflected(coat: Coat, wi: Vector, lobes: list[Proposal], u: Array, u1: Arra
     towards = wi
     if below:
         assert coat.top is not None
-        inner, enters = entered(wi, coat.top.ior)
+        inner, enters = refract_in(wi, coat.top.ior)
         towards = select(inside, inner, wi)
     out = reflect(towards, facets.sample(towards, width(kappa), u1, u2, "vmf"))
     leaves = is_above(out)
     if below:
         assert coat.top is not None
-        outer, escapes = _refracted_out(coat.top, sanitised(out))
+        outer, escapes = _refract_out(coat.top, sanitise(out))
         out, leaves = select(inside, outer, out), leaves & (~inside | (enters & escapes))
     return select(through, flip(out), out), leaves
 
@@ -138,7 +140,7 @@ def _reflected(coat: Coat, wi: Vector, lobes: list[Proposal], u: Array, u1: Arra
 def density(coat: Coat, options: Options, wi: Vector, wo: Vector, opaque: bool) -> Array:
     """Density of `draw` in solid angle, 1/sr, for wi above."""
     lit, up, down = is_above(wi), is_above(wo), is_above(flip(wo))
-    wi, over = sanitised(wi), sanitised(select(down, flip(wo), wo))
+    wi, over = sanitise(wi), sanitise(select(down, flip(wo), wo))
     lobes = [] if _is_interface(coat) else _proposals(coat, options, wi, opaque)
     by_cosine = COSINE if lobes or _is_interface(coat) else 1.0
     total = by_cosine * (1.0 if opaque else 0.5) * over[2] / jnp.pi
@@ -161,7 +163,7 @@ def _density(coat: Coat, lobe: Proposal, wi: Vector, wo: Vector) -> Array:
         h, _ = half_vector(wi, wo, same_side=True)
         return facets.reflection_pdf(h, wi, width(lobe.kappa), "vmf")
     assert coat.top is not None
-    (inner_i, enters), (inner_o, leaves) = entered(wi, coat.top.ior), entered(wo, coat.top.ior)
+    (inner_i, enters), (inner_o, leaves) = refract_in(wi, coat.top.ior), refract_in(wo, coat.top.ior)
     h, _ = half_vector(inner_i, inner_o, same_side=True)
     slope = wo[2] / (coat.top.ior * coat.top.ior * inner_o[2])  # of solid angle inside by outside
     return jnp.where(enters & leaves, slope * facets.reflection_pdf(h, inner_i, width(lobe.kappa), "vmf"), 0.0)
@@ -170,13 +172,13 @@ def _density(coat: Coat, lobe: Proposal, wi: Vector, wo: Vector) -> Array:
 def energies(coat: Coat, options: Options, wi: Vector, nodes: int, opaque: bool) -> tuple[Channels, Channels]:
     """Energy that leaves above and below, for one wi above: every lobe by a rule of its own."""
     lit = is_above(wi)
-    wi = sanitised(wi)
+    wi = sanitise(wi)
     near: list[Channels] = [(jnp.zeros_like(wi[2]),)]
     far: list[Channels] = [(jnp.zeros_like(wi[2]),)]
     lobes = _proposals(coat, options, wi, opaque)
     if lobes:
         wo, weight = _rules(coat, lobes, wi, nodes)
-        weight, wo = jnp.where(is_above(wo), weight, 0.0), sanitised(wo)
+        weight, wo = jnp.where(is_above(wo), weight, 0.0), sanitise(wo)
         split = sum(not lobe.through for lobe in lobes)
         above, below = ((wo[0][rows], wo[1][rows], wo[2][rows]) for rows in (slice(split), slice(split, None)))
         for j, values in enumerate(reflections(coat, options, wi, above)):
@@ -200,7 +202,7 @@ def _rules(coat: Coat, lobes: list[Proposal], wi: Vector, nodes: int) -> Nodes:
         kappa, start = lobe.kappa, wi
         if lobe.place == "inside":
             assert coat.top is not None
-            inner, _ = entered(wi, coat.top.ior)
+            inner, _ = refract_in(wi, coat.top.ior)
             stretch = wi[2] / (coat.top.ior * inner[2])
             start = select(coat.top.ior < 1.0, inner, wi)
             kappa = jnp.where(coat.top.ior < 1.0, kappa, kappa * stretch * stretch)
@@ -212,7 +214,7 @@ def _rules(coat: Coat, lobes: list[Proposal], wi: Vector, nodes: int) -> Nodes:
     if not any(lobe.place == "inside" for lobe in lobes):
         return wo, weight
     assert coat.top is not None
-    outer, leaves = _refracted_out(coat.top, wo)
+    outer, leaves = _refract_out(coat.top, wo)
     inside = jnp.asarray([lobe.place == "inside" for lobe in lobes])[:, None] & (coat.top.ior < 1.0)
     slope = jnp.where(leaves, coat.top.ior * coat.top.ior, 0.0)
     return select(inside, outer, wo), weight * jnp.where(inside, slope, 1.0)
@@ -225,11 +227,13 @@ def _refracted_energy(top: UpperSide, options: Options, wi: Vector, nodes: int) 
     alpha = width(top.kappa)
     polar = polar_angles(upright, planar, alpha, "vmf", top.ior, "refracted", nodes)
     at = parallels(upright, planar, polar, alpha, "vmf", top.ior, "refracted")
-    m, cosine, weight = seen_facets(upright, planar, at, alpha, "vmf", nodes)
+    m, cosine, weight = visible_normals(upright, planar, at, alpha, "vmf", nodes)
     wo, exists = refract(flat, m, top.ior)
     passes = exists & is_above(flip(wo))
-    share = (1.0 - fresnel.dielectric(cosine, top.ior)) * masked(sanitised(flip(wo)), top.kappa, options.masking)
-    lit = visible(wi, top.kappa, options.masking) / visible(wi, top.kappa, "normal")  # as the weights have it
+    share = (1.0 - fresnel.dielectric(cosine, top.ior)) * smith_masking(sanitise(flip(wo)), top.kappa, options.masking)
+    lit = masking_over_cosine(wi, top.kappa, options.masking) / masking_over_cosine(
+        wi, top.kappa, "normal"
+    )  # as the weights have it
     return lit * jnp.sum(jnp.where(passes, weight * share, 0.0))
 
 
@@ -238,7 +242,7 @@ def _is_interface(coat: Coat) -> bool:
     return coat.top is not None and coat.base is None
 
 
-def _refracted_out(top: UpperSide, inner: Vector) -> tuple[Vector, Array]:
+def _refract_out(top: UpperSide, inner: Vector) -> tuple[Vector, Array]:
     """Where light inside goes outside a level facet (both upward), and whether it does."""
     x, y = top.ior * inner[0], top.ior * inner[1]
     squared = 1.0 - x * x - y * y

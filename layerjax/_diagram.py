@@ -12,10 +12,10 @@ from typing import Literal, NamedTuple
 WIDTH, LEFT, RIGHT = 640, 8, 158
 """Size of the picture, and where its layers begin and end, in pixels."""
 
-SKY, LINE, MARGIN = 40, 17, 7
+SKY_HEIGHT, LINE, MARGIN = 40, 17, 7
 """Heights of what lies above the layers and of a line of words, and what is left above and below these."""
 
-LONGEST = 68
+MOST_LETTERS = 68
 """Letters of a line."""
 
 INTERFACE, MEDIUM, BASE = "rgba(31, 119, 180, 0.75)", "rgba(31, 119, 180, 0.18)", "rgba(140, 110, 80, 0.35)"
@@ -24,7 +24,7 @@ INTERFACE, MEDIUM, BASE = "rgba(31, 119, 180, 0.75)", "rgba(31, 119, 180, 0.18)"
 Kind = Literal["interface", "medium", "base", "nothing"]
 
 
-class Row(NamedTuple):
+class DiagramRow(NamedTuple):
     """A layer or a base: what it looks like, its name, and its numbers in words."""
 
     kind: Kind
@@ -32,11 +32,11 @@ class Row(NamedTuple):
     words: str
 
 
-def picture(rows: Sequence[Row], title: str) -> str:
+def diagram(rows: Sequence[DiagramRow], title: str) -> str:
     """SVG of the rows from top to bottom, not to scale, lit from the left and seen from the right."""
-    parts, top = [*_light()], SKY
+    parts, top = [*_light()], SKY_HEIGHT
     for row in rows:
-        lines = textwrap.wrap(row.words, LONGEST) or [""]
+        lines = textwrap.wrap(row.words, MOST_LETTERS) or [""]
         height = 2 * MARGIN + LINE * (1 + len(lines) * bool(row.words))
         parts += [*_layer(row, top, height), *_words(row, lines, top)]
         top += height
@@ -46,7 +46,7 @@ def picture(rows: Sequence[Row], title: str) -> str:
     return f'<svg xmlns="http://www.w3.org/2000/svg" {size} {look} {label}>{"".join(parts)}</svg>'
 
 
-def below_each_other(parts: Sequence[tuple[str, str]]) -> str:
+def diagram_column(parts: Sequence[tuple[str, str]]) -> str:
     """HTML of pictures below each other, under their heads."""
     return "".join(f"<div><strong>{escape(head)}</strong></div><div>{inside}</div>" for head, inside in parts)
 
@@ -57,13 +57,13 @@ def _light() -> list[str]:
     stroke = 'fill="none" stroke="currentColor" stroke-width="1.5"'
     return [
         f'<circle cx="{LEFT + 24}" cy="8" r="5" fill="rgba(240, 170, 0, 0.9)"/>',
-        f'<path d="M{LEFT + 30} 12 L{middle} {SKY} m-9 -2 l9 2 l-4 -8" {stroke}/>',
-        f'<path d="M{middle} {SKY} L{RIGHT - 32} 12 m-9 2 l9 -2 l-4 8" {stroke}/>',
+        f'<path d="M{LEFT + 30} 12 L{middle} {SKY_HEIGHT} m-9 -2 l9 2 l-4 -8" {stroke}/>',
+        f'<path d="M{middle} {SKY_HEIGHT} L{RIGHT - 32} 12 m-9 2 l9 -2 l-4 8" {stroke}/>',
         f'<path d="M{RIGHT - 29} 8 q9 -9 18 0 q-9 9 -18 0" {stroke}/><circle cx="{RIGHT - 20}" cy="8" r="2.5"/>',
     ]
 
 
-def _layer(row: Row, top: int, height: int) -> list[str]:
+def _layer(row: DiagramRow, top: int, height: int) -> list[str]:
     wide = RIGHT - LEFT
     if row.kind == "nothing":
         middle = (LEFT + RIGHT) // 2
@@ -71,7 +71,7 @@ def _layer(row: Row, top: int, height: int) -> list[str]:
         return [f'<path d="{arrow}" fill="none" stroke="currentColor" stroke-width="1.5"/>']
     if row.kind == "interface":
         facets = "".join(f" l5 {-6 if step % 2 else 6}" for step in range(wide // 5))
-        first = 3 if top == SKY else 0  # on top of all, facets stand out into the sky
+        first = 3 if top == SKY_HEIGHT else 0  # on top of all, facets stand out into the sky
         body = f'<rect x="{LEFT}" y="{top + first}" width="{wide}" height="{height - first}" fill="{MEDIUM}"/>'
         return [body, f'<path d="M{LEFT} {top + 3}{facets}" fill="none" stroke="{INTERFACE}" stroke-width="2"/>']
     colour = MEDIUM if row.kind == "medium" else BASE
@@ -87,7 +87,7 @@ def _layer(row: Row, top: int, height: int) -> list[str]:
     return [body, f'<path d="{slants}" fill="none" stroke="currentColor" stroke-width="1" opacity="0.6"/>']
 
 
-def _words(row: Row, lines: Sequence[str], top: int) -> list[str]:
+def _words(row: DiagramRow, lines: Sequence[str], top: int) -> list[str]:
     first = top + MARGIN + 13
     name = f'<text x="{RIGHT + 14}" y="{first}" font-weight="bold">{escape(row.name)}</text>'
     rest = [

@@ -6,7 +6,7 @@ from jax import Array
 
 from layerjax._numerics import horizon, safe_div
 from layerjax.channels import Channels
-from layerjax.directions import Vector, flip, half_vector, reflect, sanitised, select
+from layerjax.directions import Vector, flip, half_vector, reflect, sanitise, select
 from layerjax.normals.facets import reflection_pdf
 from layerjax.normals.ggx import ggx_sample
 from layerjax.surfaces import Surface
@@ -16,7 +16,7 @@ from layerjax.transport.statistical.coated_base import CoatedBase
 from layerjax.transport.statistical.diffuse_base import DiffuseBase
 from layerjax.transport.statistical.diffuse_lobe import DiffuseLobe
 from layerjax.transport.statistical.hazy_base import HazyBase
-from layerjax.transport.statistical.shaped import Shaped, folded, unfolded
+from layerjax.transport.statistical.microfacet_lobes import MicrofacetLobes, fold, unfold
 from layerjax.transport.statistical.streamed_base import StreamedBase
 
 DiffusePart = DiffuseBase | CoatedBase | StreamedBase | HazyBase | DiffuseLobe | Surface
@@ -24,7 +24,7 @@ DiffusePart = DiffuseBase | CoatedBase | StreamedBase | HazyBase | DiffuseLobe |
 
 
 def draw(
-    lobes: Shaped,
+    lobes: MicrofacetLobes,
     diffuse: DiffusePart | None,
     wi: Vector,
     uniforms: tuple[Array, Array, Array],
@@ -37,7 +37,7 @@ def draw(
     """
     u, u1, u2 = uniforms
     valid = wi[2] > horizon(wi[2].dtype)
-    wi = sanitised(wi, valid)
+    wi = sanitise(wi, valid)
     shares = _probabilities(lobes, diffuse, wi)
     reflected, transmitted = lobes.widths()
     alpha, passes, scatters = jnp.ones_like(u), jnp.zeros(u.shape, bool), jnp.ones(u.shape, bool)
@@ -49,25 +49,27 @@ def draw(
         passes = passes | (chosen & (index >= len(reflected)))
         scatters = scatters & ~chosen
     # what no lobe took is diffuse; where nothing is diffuse that is rounding, and drawn from a lobe of width 1
-    light = wi if not transmitted else select(passes, folded(wi, entry), wi)
+    light = wi if not transmitted else select(passes, fold(wi, entry), wi)
     wo = reflect(light, ggx_sample(light, alpha, u1, u2))
     if transmitted:
-        wo = select(passes, unfolded(wo, exit), wo)
+        wo = select(passes, unfold(wo, exit), wo)
     if diffuse is not None:
         wo = select(scatters, sample_cosine(u1, u2), wo)
     lost = ~valid | (~passes & (wo[2] < 0))
     return (wo[0], wo[1], jnp.where(lost, 0.0, wo[2]))
 
 
-def density(lobes: Shaped, diffuse: DiffusePart | None, wi: Vector, wo: Vector, entry: Array, exit: Array) -> Array:
+def density(
+    lobes: MicrofacetLobes, diffuse: DiffusePart | None, wi: Vector, wo: Vector, entry: Array, exit: Array
+) -> Array:
     """Density of `draw` in solid angle, 1/sr."""
     edge = horizon(wi[2].dtype)
     lit = wi[2] > edge
-    wi = sanitised(wi, lit)
+    wi = sanitise(wi, lit)
     shares = _probabilities(lobes, diffuse, wi)
     reflected, transmitted = lobes.widths()
     above = wo[2] > edge
-    up = sanitised(wo, above)
+    up = sanitise(wo, above)
     h, _ = half_vector(wi, up, same_side=True)
     rest = 1.0 - sum(shares[: len(reflected) + len(transmitted)], jnp.zeros_like(wi[2]))
     total = jnp.zeros_like(wi[2] * wo[2])
@@ -78,10 +80,10 @@ def density(lobes: Shaped, diffuse: DiffusePart | None, wi: Vector, wo: Vector, 
     total = jnp.where(above, total, 0.0)
     if transmitted:
         below = wo[2] < -edge
-        under = sanitised(flip(wo), below)
-        a, b = folded(wi, entry), folded(under, exit)
+        under = sanitise(flip(wo), below)
+        a, b = fold(wi, entry), fold(under, exit)
         below = below & (a[2] > edge) & (b[2] > edge)
-        a, b = sanitised(a, below), sanitised(b, below)
+        a, b = sanitise(a, below), sanitise(b, below)
         h, _ = half_vector(a, b, same_side=True)
         stretch = exit * exit * under[2] / b[2]
         for share, alpha in zip(shares[len(reflected) :], transmitted, strict=False):
@@ -103,7 +105,7 @@ def diffuse_part(diffuse: DiffusePart, wi: Vector, wo: Vector) -> Channels:
     return diffuse.value(wi, wo)
 
 
-def _probabilities(lobes: Shaped, diffuse: DiffusePart | None, wi: Vector) -> list[Array]:
+def _probabilities(lobes: MicrofacetLobes, diffuse: DiffusePart | None, wi: Vector) -> list[Array]:
     """Probabilities of the lobes, in their order; the rest to 1 is that of the diffuse part."""
     energies = [jnp.where(share > 1e-6, share, 1e-6) for share in lobes.shares()]
     if not energies:

@@ -10,17 +10,17 @@ import jax.numpy as jnp
 from jax import Array
 
 from layerjax import channels, fresnel
-from layerjax._numerics import at_least, safe_sqrt, unstacked
-from layerjax.channels import Channels, each
+from layerjax._numerics import clamp_min, safe_sqrt, unstack
+from layerjax.channels import Channels, map_channels
 from layerjax.directions import Vector
-from layerjax.microsurface.energy_tables import mirror_energy, retained_share, single_reflectance
+from layerjax.microsurface.energy_tables import escape_cone_share, mirror_energy, single_reflectance
 from layerjax.stack import Interface, Stack
 from layerjax.surfaces import Conductor
 from layerjax.transport.statistical.lobes import (
     STEEPEST,
     Options,
     Statistics,
-    bounded,
+    bound_alpha,
     lobe_roughness,
     metal_levels,
     precision,
@@ -40,7 +40,7 @@ Facet = tuple[Interface | Conductor, Array, bool]
 index of what it is in), and whether it is smooth."""
 
 
-class ShapedLobe(NamedTuple):
+class MicrofacetLobe(NamedTuple):
     """A lobe by its energy, its energy over that of the unscaled lobe, and its roughness; None: the facet itself."""
 
     energy: Channels
@@ -56,11 +56,11 @@ class _Lobe(NamedTuple):
     cosine: Array
 
 
-class Shaped(NamedTuple):
+class MicrofacetLobes(NamedTuple):
     """Lobes for light along some cosines: the reflected ones, and the transmitted ones (none over a base)."""
 
-    reflected: tuple[ShapedLobe, ...]
-    transmitted: tuple[ShapedLobe, ...]
+    reflected: tuple[MicrofacetLobe, ...]
+    transmitted: tuple[MicrofacetLobe, ...]
     facet: Facet | None
 
     def energies(self, dark: Array) -> tuple[Channels, Channels]:
@@ -78,29 +78,29 @@ class Shaped(NamedTuple):
         reflected, transmitted = ([self._width(lobe) for lobe in side] for side in (self.reflected, self.transmitted))
         return reflected, transmitted
 
-    def _width(self, lobe: ShapedLobe) -> Array:
+    def _width(self, lobe: MicrofacetLobe) -> Array:
         if lobe.alpha is None:
             assert self.facet is not None
             return jnp.asarray(self.facet[0].alpha)
-        return bounded(channels.mean(lobe.alpha))
+        return bound_alpha(channels.mean(lobe.alpha))
 
 
-def shaped(stack: Stack, options: Options, cosine: Array, upward: bool) -> Shaped:
+def microfacet_lobes(stack: Stack, options: Options, cosine: Array, upward: bool) -> MicrofacetLobes:
     """Lobes of a simplified stack, lit from above, or from below (`upward`). Diffuse bases are omitted."""
-    cosine = at_least(cosine, GRAZING)
+    cosine = clamp_min(cosine, GRAZING)
     found = statistics(stack, cosine, options, upward)
-    reflected, facet = _returning(found, cosine)
-    transmitted, escaping = _passing(stack, found, cosine, upward)
-    alphas, unscaled = _widths(reflected, transmitted, escaping)
+    reflected, facet = _reflected_lobes(found, cosine)
+    transmitted, escaping = _transmitted_lobes(stack, found, cosine, upward)
+    alphas, unscaled = _alphas_and_energies(reflected, transmitted, escaping)
     if facet is not None:  # its lobe is the first
-        unscaled[0] = _of_facet(*facet, cosine)
-    lobes = tuple(map(_scaled, [*reflected, *transmitted], alphas, unscaled))
-    return Shaped(lobes[: len(reflected)], lobes[len(reflected) :], facet)
+        unscaled[0] = _facet_energy(*facet, cosine)
+    lobes = tuple(map(_scale, [*reflected, *transmitted], alphas, unscaled))
+    return MicrofacetLobes(lobes[: len(reflected)], lobes[len(reflected) :], facet)
 
 
-def _scaled(lobe: _Lobe, alpha: Channels, unscaled: Channels) -> ShapedLobe:
-    scale = each(lambda energy, whole: energy / at_least(whole, LEAST_ENERGY), lobe.energy, unscaled)
-    return ShapedLobe(lobe.energy, scale, alpha or None)
+def _scale(lobe: _Lobe, alpha: Channels, unscaled: Channels) -> MicrofacetLobe:
+    scale = map_channels(lambda energy, whole: energy / clamp_min(whole, LEAST_ENERGY), lobe.energy, unscaled)
+    return MicrofacetLobe(lobe.energy, scale, alpha or None)
 
 
 def index_below(stack: Stack) -> Array:
@@ -113,22 +113,22 @@ def index_below(stack: Stack) -> Array:
 
 def reference_index(stack: Stack) -> Array:
     """Index of the medium in which transmitted lobes are described: the larger of those above and below."""
-    return at_least(index_below(stack), 1.0)
+    return clamp_min(index_below(stack), 1.0)
 
 
-def folded(w: Vector, ratio: Array) -> Vector:
+def fold(w: Vector, ratio: Array) -> Vector:
     """The upper direction that w becomes, from either side, in a medium that is 1 / ratio times as dense."""
     squared = 1.0 - ratio * ratio + (ratio * w[2]) ** 2
     return ratio * w[0], ratio * w[1], safe_sqrt(squared)
 
 
-def unfolded(w: Vector, ratio: Array) -> Vector:
-    """The lower direction that `folded` takes to w; in the tangent plane if there is none."""
+def unfold(w: Vector, ratio: Array) -> Vector:
+    """The lower direction that `fold` takes to w; in the tangent plane if there is none."""
     x, y = w[0] / ratio, w[1] / ratio
     return x, y, -jnp.where(w[2] > 0, safe_sqrt(1.0 - x * x - y * y), 0.0)
 
 
-def _returning(statistics: Statistics, cosine: Array) -> tuple[list[_Lobe], Facet | None]:
+def _reflected_lobes(statistics: Statistics, cosine: Array) -> tuple[list[_Lobe], Facet | None]:
     """The reflected lobes by orders, and the facet that stands for one of them itself, if any does."""
     facet: Facet | None = None
     lobes = []
@@ -138,12 +138,12 @@ def _returning(statistics: Statistics, cosine: Array) -> tuple[list[_Lobe], Face
             if entry.facet is not None and order == 0:
                 facet = entry.facet
             else:
-                sigma = _widened(entry.lobe.variance, entry.spread, order)
+                sigma = _order_variance(entry.lobe.variance, entry.spread, order)
             lobes.append(_Lobe(energy, sigma, cosine))
     return lobes, facet
 
 
-def _passing(stack: Stack, statistics: Statistics, cosine: Array, upward: bool) -> tuple[list[_Lobe], Array]:
+def _transmitted_lobes(stack: Stack, statistics: Statistics, cosine: Array, upward: bool) -> tuple[list[_Lobe], Array]:
     """The transmitted lobes by orders, in the medium of the reference index, none over a base.
 
     Also the largest sine there that is not totally reflected on the way out. What nothing meets (no interface, no
@@ -160,12 +160,12 @@ def _passing(stack: Stack, statistics: Statistics, cosine: Array, upward: bool) 
     lobes: list[_Lobe] = []
     for order, energy in enumerate(statistics.transmitted.energy):
         if order > 0 or met:
-            sigma = _widened(statistics.transmitted.variance, statistics.transmitted_spread, order)
+            sigma = _order_variance(statistics.transmitted.variance, statistics.transmitted_spread, order)
             lobes.append(_Lobe(energy, tuple(widening * part for part in sigma), here))
     return lobes, leaves / reference
 
 
-def _widths(
+def _alphas_and_energies(
     reflected: Sequence[_Lobe], transmitted: Sequence[_Lobe], escaping: Array
 ) -> tuple[list[Channels], list[Channels]]:
     """Roughness and unscaled energy of every lobe and channel, at one look; nothing for the facet itself.
@@ -182,18 +182,18 @@ def _widths(
     beyond = sum(len(lobe.variance or ()) for lobe in transmitted)
     if beyond:
         cosine, width = cosine[-beyond:], alpha[-beyond:]
-        passed = energy[-beyond:] * retained_share(cosine, width, escaping)
+        passed = energy[-beyond:] * escape_cone_share(cosine, width, escaping)
         energy = jnp.concatenate([energy[:-beyond], passed])
-    rows = zip(unstacked(alpha), unstacked(energy), strict=True)
+    rows = zip(unstack(alpha), unstack(energy), strict=True)
     found = [[next(rows) for _ in lobe.variance or ()] for lobe in lobes]
     return [tuple(a for a, _ in lobe) for lobe in found], [tuple(e for _, e in lobe) for lobe in found]
 
 
-def _widened(variance: Channels, spread: Channels | None, order: int) -> Channels:
-    return variance if spread is None or order == 0 else each(lambda v, s: v + order * s, variance, spread)
+def _order_variance(variance: Channels, spread: Channels | None, order: int) -> Channels:
+    return variance if spread is None or order == 0 else map_channels(lambda v, s: v + order * s, variance, spread)
 
 
-def _of_facet(what: Interface | Conductor, relative: Array, smooth: bool, cosine: Array) -> Channels:
+def _facet_energy(what: Interface | Conductor, relative: Array, smooth: bool, cosine: Array) -> Channels:
     """Energy that the facets of the first interface or base reflect at their first collision."""
     if isinstance(what, Conductor):
         return metal_levels(what, cosine, relative, multiple=False, smooth=smooth)

@@ -6,7 +6,7 @@ import jax
 import numpy as np
 
 
-def known_values(value: Any) -> np.ndarray | None:
+def concrete_values(value: Any) -> np.ndarray | None:
     """The numbers that a leaf holds; None if it is traced and nothing is known of it yet, as under ``jit``.
 
     Of what `grad` and its like differentiate outside of ``jit``, the primal; under `vmap` the whole batch.

@@ -1,7 +1,7 @@
 """What the facets of an interface or a base do to light from every node: how much they reflect, what they let pass.
 
-Energies are sums over `seen_facets`, right to 1e-4 with few points. Light that is to be put on nodes needs points as
-dense as the nodes, unless only smooth functions are ever summed over it.
+Energies are sums over `visible_normals`, right to 1e-4 with few points. Light that is to be put on nodes needs points
+as dense as the nodes, unless only smooth functions are ever summed over it.
 """
 
 from collections.abc import Callable
@@ -12,11 +12,11 @@ import numpy as np
 from jax import Array
 
 from layerjax import fresnel
-from layerjax._batching import by_rows
-from layerjax._numerics import at_least, at_most, safe_sqrt
-from layerjax.directions import Vector, combine, dot, normalize, reflect, sanitised
+from layerjax._batching import map_row_chunks
+from layerjax._numerics import clamp_max, clamp_min, safe_sqrt
+from layerjax.directions import Vector, combine, dot, normalize, reflect, sanitise
 from layerjax.normals import facets
-from layerjax.normals.facet_rule import Parallels, Way, parallels, polar_angles, seen_facets
+from layerjax.normals.facet_rule import FacetEvent, Parallels, parallels, polar_angles, visible_normals
 from layerjax.quadrature import gauss_legendre
 from layerjax.transport.adding_doubling.grid import Grid, Region
 
@@ -24,7 +24,7 @@ ENERGY_POINTS = (12, 8)
 """Points a panel, and in azimuth, of the quadrature of energies."""
 
 LEAST_FACETS, LEAST_OF_SEVERAL = 16, 24
-"""Points of the dense quadrature of visible normals in either direction, at least (`refracted_densely`): of a single
+"""Points of the dense quadrature of visible normals in either direction, at least (`dense_refracted_rays`): of a single
 interface, and where there are several, between which light continues."""
 
 CRITICAL = 7.5
@@ -43,45 +43,50 @@ def facet_energies(near: Region, far: Region, normals: Normals) -> tuple[Array, 
     reflected = reflected_energy(near, far.ior / near.ior, normals)
     _, passed = refracted_rays(near, far.ior / near.ior, normals, ENERGY_POINTS)
     # by quadrature it may be a little more than there is
-    refracted = at_most(jnp.sum(passed, axis=-1), 1.0 - reflected)
+    refracted = clamp_max(jnp.sum(passed, axis=-1), 1.0 - reflected)
     return reflected, refracted, jnp.where(near.exists, 1.0 - reflected - refracted, 0.0)
 
 
 def reflected_energy(region: Region, ratio: Array, normals: Normals) -> Array:
     def energy(m: Vector, facing: Array, weight: Array, wi: Vector) -> Array:
-        level = fresnel.dielectric(facing, ratio) * seen_share(reflect(wi, m), normals)
+        level = fresnel.dielectric(facing, ratio) * smith_masking(reflect(wi, m), normals)
         return jnp.sum(weight * level, axis=-1)
 
-    return of_facets(energy, region, normals, ratio, "reflected", ENERGY_POINTS)
+    return map_visible_normals(energy, region, normals, ratio, "reflected", ENERGY_POINTS)
 
 
 def refracted_rays(region: Region, ratio: Array, normals: Normals, points: tuple[int, int]) -> tuple[Vector, Array]:
     """Of light from every node: where facets refract it to, and how much."""
 
     def rays(m: Vector, facing: Array, weight: Array, wi: Vector) -> tuple[Vector, Array]:
-        return _through(wi, m, facing, weight, ratio, normals)
+        return _refract(wi, m, facing, weight, ratio, normals)
 
-    return of_facets(rays, region, normals, ratio, "refracted", points)
+    return map_visible_normals(rays, region, normals, ratio, "refracted", points)
 
 
-def of_facets(
-    function: Callable[..., Any], region: Region, normals: Normals, ratio: Array, way: Way, points: tuple[int, int]
+def map_visible_normals(
+    function: Callable[..., Any],
+    region: Region,
+    normals: Normals,
+    ratio: Array,
+    event: FacetEvent,
+    points: tuple[int, int],
 ) -> Any:
-    """function(m, m . wi, weights, wi) of the normals seen from the nodes, (nodes, points); see `seen_facets`."""
+    """function(m, m . wi, weights, wi) of the normals seen from the nodes, (nodes, points); see `visible_normals`."""
     alpha, kind = jnp.asarray(normals.alpha, region.cosine.dtype), normals.distribution
 
     def of_nodes(rows: tuple[Array, ...]) -> Any:
-        cosine, sine, *at = rows
+        cosine, sine, *circles = rows
         wi: Vector = (-sine[:, None], jnp.zeros_like(sine[:, None]), cosine[:, None])
-        return function(*seen_facets(cosine, sine, Parallels(*at), alpha, kind, points[1]), wi)
+        return function(*visible_normals(cosine, sine, Parallels(*circles), alpha, kind, points[1]), wi)
 
-    polar = polar_angles(region.cosine, region.sine, alpha, kind, ratio, way, points[0])
+    polar = polar_angles(region.cosine, region.sine, alpha, kind, ratio, event, points[0])
     # outside of the loop: kept in memory, not computed again for each of the facets' numbers
-    at = parallels(region.cosine, region.sine, polar, alpha, kind, ratio, way)
-    return by_rows(of_nodes, (region.cosine, region.sine, *at))
+    circles = parallels(region.cosine, region.sine, polar, alpha, kind, ratio, event)
+    return map_row_chunks(of_nodes, (region.cosine, region.sine, *circles))
 
 
-def _through(
+def _refract(
     wi: Vector, m: Vector, facing: Array, weight: Array, ratio: Array, normals: Normals, blur: Array | None = None
 ) -> tuple[Vector, Array]:
     """Where facets refract light to, z counted on the far side, and how much: nothing under total reflection.
@@ -99,10 +104,10 @@ def _through(
         jnp.where(exists, down[1], 0.0),
         jnp.where(exists, -down[2], 0.8),
     )
-    return wo, jnp.where(exists, weight * (1.0 - level) * seen_share(wo, normals), 0.0)
+    return wo, jnp.where(exists, weight * (1.0 - level) * smith_masking(wo, normals), 0.0)
 
 
-def refracted_densely(grid: Grid, near: Region, far: Region, normals: Normals, modes: int) -> tuple[Vector, Array]:
+def dense_refracted_rays(grid: Grid, near: Region, far: Region, normals: Normals, modes: int) -> tuple[Vector, Array]:
     """Of light from every near node, by facets: where to and how much is refracted."""
     ratio = far.ior / near.ior
     if normals.distribution == "vmf":
@@ -111,7 +116,7 @@ def refracted_densely(grid: Grid, near: Region, far: Region, normals: Normals, m
     m, weight, wi = _ggx_normals(grid, near, normals.alpha, modes)
     # the squared cosine of refraction changes by so much with the angle at the facet where it is 0
     steepness = 2.0 * safe_sqrt((1.0 - ratio) * (1.0 + ratio)) / ratio
-    return _through(
+    return _refract(
         wi, m, dot(wi, m), weight, ratio, normals, CRITICAL * facet_spacing(polar_count(grid), normals) * steepness
     )
 
@@ -124,15 +129,15 @@ def facet_spacing(points: int, normals: Normals) -> Array:
 
 def polar_count(grid: Grid) -> int:
     """Points from pole to rim of the dense quadrature of visible normals."""
-    return max(_least(grid), 3 * grid.nodes // 2)
+    return max(_least_points(grid), 3 * grid.nodes // 2)
 
 
 def azimuth_count(grid: Grid, modes: int) -> int:
     """Azimuths at each of them."""
-    return max(_least(grid), 3 * modes // 4)
+    return max(_least_points(grid), 3 * modes // 4)
 
 
-def _least(grid: Grid) -> int:
+def _least_points(grid: Grid) -> int:
     return LEAST_OF_SEVERAL if grid.interfaces > 1 else LEAST_FACETS
 
 
@@ -155,13 +160,13 @@ def _ggx_normals(grid: Grid, region: Region, width: Array, modes: int) -> tuple[
     weight = jnp.sin(polar) * (rim * w / (1.0 + v[2]))[:, :, None] * (jnp.ones_like(phi) / azimuth_facets)
     sine, cosine = jnp.sin(polar), jnp.cos(polar)
     x, y = v[0][:, :, None] + sine * jnp.cos(phi), sine * jnp.sin(phi)
-    z = at_least(v[2][:, :, None] + cosine, 0.0) * jnp.ones_like(phi)
+    z = clamp_min(v[2][:, :, None] + cosine, 0.0) * jnp.ones_like(phi)
     nodes = region.cosine.shape[0]
     flat = tuple(jnp.reshape(part, (nodes, -1)) for part in (alpha * x, alpha * y, z))
     return normalize((flat[0], flat[1], flat[2])), weight.reshape(nodes, -1), wi
 
 
-def seen_share(wo: Vector, normals: Normals) -> Array:
+def smith_masking(wo: Vector, normals: Normals) -> Array:
     """Smith masking of the outgoing direction, 0 below the horizon."""
     above = wo[2] > 0
-    return jnp.where(above, facets.masking(sanitised(wo, above), *normals), 0.0)
+    return jnp.where(above, facets.masking(sanitise(wo, above), *normals), 0.0)

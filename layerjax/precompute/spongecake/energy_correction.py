@@ -1,9 +1,9 @@
-"""Teaches the networks of `layerjax.transport.spongecake.bending` what `layerjax.precompute.spongecake.energy` finds.
+"""Trains the networks of `layerjax.transport.spongecake.energy_correction` by `layerjax.precompute.spongecake.energy`.
 
 Materials are drawn as those that second lobes are learned from, but without absorption, and narrow lobes with an axis
 are there as well: nothing has to be solved for them. Loss of a material: what is missing of the energy that several
-collisions leave, energy times the relative error of c, as a root mean square over directions of light, and `FAR` times
-its square.
+collisions leave, energy times the relative error of c, as a root mean square over directions of light, and
+`TAIL_WEIGHT` times its square.
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -22,13 +22,13 @@ from layerjax.precompute.spongecake.data import KINDS, WIDTHS, draw_layers, stac
 from layerjax.precompute.spongecake.energy import Rule, balance
 from layerjax.precompute.spongecake.training import numbers_of
 from layerjax.stack import media_of
-from layerjax.transport.spongecake.bending import POWER, bend_network, coefficients_of, polynomial
+from layerjax.transport.spongecake.energy_correction import POWER, coefficients_of, correction_network, polynomial
 from layerjax.transport.spongecake.mapping import Numbers
 
 SHARD = 256
 """Materials a shard, of one structure."""
 
-FAR = 8.0
+TAIL_WEIGHT = 8.0
 """Weight of the squared error beside the error itself, for the sake of the few that are far off."""
 
 RULE = Rule(nodes=12, cosines=6, azimuths=8, rounds=8)
@@ -38,7 +38,7 @@ SALT = 1
 """Tells random numbers from those of other materials of the same seed."""
 
 
-class Bent(NamedTuple):
+class Corrections(NamedTuple):
     """n materials, and what c is at d directions: wi (n, d, 3), energy and log c (n, d)."""
 
     media: Numbers
@@ -56,25 +56,31 @@ def make(folder: Path, count: int, media: int, nets: Mapping[int, eqx.nn.MLP], s
     for number in range(-(-count // SHARD)):
         path = _path(folder, media, seed, number)
         if not path.exists():
-            bent = shard(number, media, nets, seed)
+            corrections = shard(number, media, nets, seed)
             temporary = path.with_suffix(".part")
             with temporary.open("wb") as file:
-                np.savez_compressed(file, **bent.media._asdict(), wi=bent.wi, energy=bent.energy, log=bent.log)
+                np.savez_compressed(
+                    file,
+                    **corrections.media._asdict(),
+                    wi=corrections.wi,
+                    energy=corrections.energy,
+                    log=corrections.log,
+                )
             temporary.replace(path)
         yield (number + 1) * SHARD
 
 
-def load(folder: Path, count: int, media: int, seed: int) -> Bent:
+def load(folder: Path, count: int, media: int, seed: int) -> Corrections:
     """The first materials that `make` has left in the folder, all shards put together."""
     parts = []
     for number in range(-(-count // SHARD)):
         with np.load(_path(folder, media, seed, number)) as archive:
             parts.append(dict(archive))
     whole: dict[str, Any] = {name: np.concatenate([part[name] for part in parts])[:count] for name in parts[0]}
-    return Bent(Numbers(*(whole[name] for name in Numbers._fields)), whole["wi"], whole["energy"], whole["log"])
+    return Corrections(Numbers(*(whole[name] for name in Numbers._fields)), whole["wi"], whole["energy"], whole["log"])
 
 
-def shard(number: int, media: int, nets: Mapping[int, eqx.nn.MLP], seed: int) -> Bent:
+def shard(number: int, media: int, nets: Mapping[int, eqx.nn.MLP], seed: int) -> Corrections:
     """Materials of one shard: the same for the same number, seed and networks."""
     # one number more than other materials are drawn with: what is tested with there must not be learned from here
     random = np.random.default_rng([seed, media, SALT, SALT, number])
@@ -84,12 +90,12 @@ def shard(number: int, media: int, nets: Mapping[int, eqx.nn.MLP], seed: int) ->
         given = {name: jnp.asarray(array, jnp.float32) for name, array in vars(layers).items() if name != "kind"}
         wi, energy, log = _balances(names, nets, given)
     turns = RULE.azimuths if set(names) == {"hg"} else 1  # as many directions for all
-    return Bent(numbers_of(layers), *(cast(Array, np.repeat(part, turns, axis=1)) for part in (wi, energy, log)))
+    return Corrections(numbers_of(layers), *(cast(Array, np.repeat(part, turns, axis=1)) for part in (wi, energy, log)))
 
 
 def train(
     media: int,
-    bent: Bent,
+    corrections: Corrections,
     seed: int,
     schedule: Schedule,
     state: Path | None = None,
@@ -97,32 +103,32 @@ def train(
 ) -> tuple[eqx.nn.MLP, CURVE]:
     """The trained network, and the mean loss of each epoch; as `layerjax.precompute.learning.learn`."""
 
-    def drawn(random: np.random.Generator, rows: NDArray[np.int64]) -> tuple[Bent]:
-        return (rows_of(bent, rows),)
+    def drawn(random: np.random.Generator, rows: NDArray[np.int64]) -> tuple[Corrections]:
+        return (select(corrections, rows),)
 
-    net = bend_network(media, jax.random.key(seed))
-    return learn(net, _loss, drawn, len(bent.log), [seed, media, SALT], schedule, state, report)
+    net = correction_network(media, jax.random.key(seed))
+    return learn(net, _loss, drawn, len(corrections.log), [seed, media, SALT], schedule, state, report)
 
 
-def rows_of(bent: Bent, rows: NDArray[np.int64] | slice) -> Bent:
+def select(corrections: Corrections, rows: NDArray[np.int64] | slice) -> Corrections:
     """Some of the materials."""
-    return jax.tree.map(lambda part: part[rows], bent)
+    return jax.tree.map(lambda part: part[rows], corrections)
 
 
-def errors(net: eqx.nn.MLP, bent: Bent) -> Array:
+def errors(net: eqx.nn.MLP, corrections: Corrections) -> Array:
     """Energy that is missing, by material and direction of light, to the first order, (n, d)."""
-    return jax.vmap(lambda one: one.energy * POWER * (_root(net, one) * jnp.exp(-one.log / POWER) - 1.0))(bent)
+    return jax.vmap(lambda one: one.energy * POWER * (_root(net, one) * jnp.exp(-one.log / POWER) - 1.0))(corrections)
 
 
-def _loss(net: eqx.nn.MLP, bent: Bent) -> Array:
-    squares = jnp.mean(errors(net, bent) ** 2, axis=-1)
-    return jnp.mean(jnp.sqrt(squares + 1e-8) + FAR * squares)
+def _loss(net: eqx.nn.MLP, corrections: Corrections) -> Array:
+    squares = jnp.mean(errors(net, corrections) ** 2, axis=-1)
+    return jnp.mean(jnp.sqrt(squares + 1e-8) + TAIL_WEIGHT * squares)
 
 
-def _root(net: eqx.nn.MLP, bent: Bent) -> Array:
+def _root(net: eqx.nn.MLP, corrections: Corrections) -> Array:
     """Root of c of one material at its directions, (d,)."""
-    sides = coefficients_of(net, bent.media, True)
-    wi = (bent.wi[:, 0], bent.wi[:, 1], bent.wi[:, 2])
+    sides = coefficients_of(net, corrections.media, True)
+    wi = (corrections.wi[:, 0], corrections.wi[:, 1], corrections.wi[:, 2])
     if len(sides) == 1:
         return polynomial(sides[0], wi, True)
     above, below = (polynomial(side, wi, False) for side in sides)
