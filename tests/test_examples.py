@@ -40,6 +40,7 @@ def test_the_table_of_predictions_rounds_the_results() -> None:
             ]
 
 
+@pytest.mark.slow
 def test_a_painted_plate_is_found_again(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -39,6 +39,7 @@ def test_plain_numpy_agrees_with_layerjax(scene: Scene) -> None:
     np.testing.assert_allclose(plain, ours(scene, wi, wo), rtol=1e-10 if scene.side == "all" else 1e-13)
 
 
+@pytest.mark.slow
 @BY_NAME
 def test_finite_differences_agree_with_layerjax(scene: Scene) -> None:
     """Tolerance: forward differences with a step of sqrt(eps) keep some 7 digits of slopes of the size of the loss."""
@@ -97,6 +98,7 @@ def test_a_tiny_throughput_run_writes_whole_files(tmp_path: Path) -> None:
     assert all(row["ours"] > 0 and row["theirs"] > 0 for row in content["inference"])
 
 
+@pytest.mark.slow
 def test_a_tiny_run_of_maps_writes_whole_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A cheap transport keeps its texels, one that takes longer than it may has fewer of them; memory does not grow."""
     few = [material for material in MATERIALS if isinstance(material.transport, lj.SingleScattering)]

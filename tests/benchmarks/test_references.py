@@ -11,6 +11,7 @@ from benchmarks.peers import disort
 from benchmarks.studies.references import cold, speed
 
 
+@pytest.mark.slow
 def test_a_tiny_table_of_speeds() -> None:
     """Paths with one event alone, which are cheap: every resolution is as good."""
     size = speed.Size(rounds=1, resolutions=((2, 1), (4, 4)), orders="first", cold=("value",))

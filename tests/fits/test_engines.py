@@ -126,6 +126,7 @@ def test_leaving_the_loop_cancels_what_was_submitted(client, tmp_path):
     wait_until(lambda: not any(client.processing().values()))
 
 
+@pytest.mark.slow
 def test_a_script_without_a_main_guard_is_refused(tmp_path):
     (tmp_path / "script.py").write_text(SCRIPT.format(guard="", work="slow", folder=str(tmp_path)))
     with started([str(tmp_path / "script.py")]) as process:

@@ -9,7 +9,8 @@ from fits.reports import verdicts
 from tests.helpers.models import LINE, line, line_data
 
 
-@pytest.mark.parametrize("discrepancy", [pytest.param(False, marks=pytest.mark.slow), True])
+@pytest.mark.slow
+@pytest.mark.parametrize("discrepancy", [False, True])
 def test_fits_and_what_follows_from_them(discrepancy: bool) -> None:
     """Starts run in threads, which have settings of their own."""
     noise = fits.Noise(relative=0.02, floor=1e-4, discrepancy=discrepancy)

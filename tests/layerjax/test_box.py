@@ -111,6 +111,7 @@ def test_no_draw_gains_energy(name):
     assert (weight > 0).mean() > 0.1
 
 
+@pytest.mark.slow
 def test_tangent_and_unnormalised_directions_give_no_nan():
     """Traced directions cannot be refused."""
     layers = three({k: v[0] for k, v in draw(1)[0].items()})  # each in a stack of its own, over another base

@@ -169,6 +169,7 @@ def test_chunks_that_do_not_fill():
     np.testing.assert_allclose(values[-1], lj.evaluate(alone, wi, wo, lj.WeidlichWilkie()), rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_an_axis_that_is_the_normal_stays_so():
     """Media that are symmetric about it are solved in modes, in a map as well."""
 

@@ -30,12 +30,16 @@ PARTS = [
     (SOLVER, HAZE, FOG),
 ]
 """Two of one structure share their programs; parts of two structures are of the transports that compile least."""
-by_transport = pytest.mark.parametrize(
-    ("transport", "one", "other"), PARTS, ids=[type(transport).__name__ for transport, _, _ in PARTS]
+SLOW = lj.Statistical | lj.ENDF | lj.AddingDoubling
+
+
+@pytest.mark.parametrize(
+    ("transport", "one", "other"),
+    [
+        pytest.param(*given, id=type(given[0]).__name__, marks=[pytest.mark.slow] * isinstance(given[0], SLOW))
+        for given in PARTS
+    ],
 )
-
-
-@by_transport
 def test_everything_is_the_mean_of_the_parts(transport, one, other) -> None:
     mixed = lj.Mixture({"one": one, "other": other}, [0.3, 0.7])
     prepared = lj.prepare(mixed, transport)
@@ -185,7 +189,7 @@ def test_a_family_of_mixtures_is_no_mixture() -> None:
         lj.evaluate(family, WI, WO)
 
 
-@pytest.mark.parametrize("height", [-0.84, 0.84])
+@pytest.mark.parametrize("height", [pytest.param(-0.84, marks=pytest.mark.slow), 0.84])
 def test_draws_are_those_of_the_albedo(height: float) -> None:
     """From below one part reflects nothing: what is drawn of it must not count for the other. Prepared or not."""
     mixed = lj.Mixture(

@@ -36,7 +36,7 @@ OPAQUE["mixture"] = lj.Mixture({"metal": OPAQUE["conductor"], "dusty": OPAQUE["h
 CASES = [(name, stack, ABOVE) for name, stack in (STACKS | OPAQUE).items()]
 CASES += [(name, STACKS[name], BELOW) for name in ("surface, tilted", "fiber, in the plane", "haze", "three layers")]
 CASES += [(name, OPAQUE[name], GRAZING) for name in ("oren-nayar", "conductor")]
-QUICK = ("lambertian", "oren-nayar", "conductor", "fiber, upright", "haze", "haze, from below")
+QUICK = ("lambertian", "oren-nayar", "conductor", "haze", "haze, from below")
 """The others are slow: they draw in the same ways."""
 CASES = [
     pytest.param(*case, id=f"{case[0]}, theta {case[2][0]}", marks=[pytest.mark.slow] * (named not in QUICK))

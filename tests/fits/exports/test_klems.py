@@ -42,6 +42,7 @@ def sheet_file(tmp_path_factory):
     return fits.export(SHEET, path, "klems", transport=TRANSPORT).path
 
 
+@pytest.mark.slow
 def test_columns_hold_what_the_stack_sends(sheet_file):
     sheet, projected = matrices(sheet_file), projected_solid_angles()
     assert projected.sum() == pytest.approx(np.pi)

@@ -90,6 +90,7 @@ def units_of(values):
     return (natural - LOW) / (HIGH - LOW)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", PRIORS)
 def test_it_ends_where_a_joint_minimisation_does(smoothed, predict, measured, kind):
     map, (first, second) = smoothed[kind], np.array(PAIRS).T

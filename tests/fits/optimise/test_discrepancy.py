@@ -49,6 +49,7 @@ def test_a_wrong_shape_is_fitted_with_them(wrong):
         assert wrong.standard_errors[name] > 2.0 * plain.standard_errors[name]
 
 
+@pytest.mark.slow
 def test_simulated_readings_share_errors(wrong):
     chain = np.tile(wrong.vector, (64, 16, 1))
     posterior = Posterior(wrong, chain, chain[..., 0], np.ones(chain.shape[-1]), 1.0, converged=True)

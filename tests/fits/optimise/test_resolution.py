@@ -64,6 +64,7 @@ def is_coarse(transport):
     return (transport.nodes, transport.modes) == (COARSE.nodes, COARSE.modes)
 
 
+@pytest.mark.slow
 def test_a_coarse_one_stays_where_it_will_do():
     found = fit(STACK, measured(WIDE, 0.05), starts=1)
     assert is_coarse(found.problem.transport)

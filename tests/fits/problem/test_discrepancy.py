@@ -104,7 +104,7 @@ def logarithms(of: Problem) -> tuple[np.ndarray, np.ndarray]:
     return np.arcsinh(values / s), -np.log(np.hypot(values, s))
 
 
-@pytest.mark.parametrize("channels", [1, 3])
+@pytest.mark.parametrize("channels", [1, pytest.param(3, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_likelihoods_of_all_and_of_each_given_the_others_are_those_of_the_dense_matrix(
     layout: str, channels: int
@@ -243,6 +243,7 @@ def test_a_smooth_process_has_a_root_in_single_precision() -> None:
     np.testing.assert_allclose(rough, found, atol=1e-2 * float(jnp.max(jnp.abs(found))))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("double", [False, True])
 def test_channels_that_share_all_errors_have_finite_densities(double: bool) -> None:
     """At a correlation of 1, with noise far below the discrepancy, the covariance was no longer positive definite."""

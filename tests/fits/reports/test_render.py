@@ -36,6 +36,7 @@ def test_an_opaque_material_has_no_picture_from_behind() -> None:
     assert not any("transmitted" in title for title in titles)
 
 
+@pytest.mark.slow
 def test_a_sheet_is_also_seen_from_behind() -> None:
     titles = [axes.get_title(loc="left") for axes in render(lj.Stack([lj.Medium(0.7, 0.9)]), SINGLE, size=16).axes]
     assert {"from behind", "BSDF in the plane of incidence, transmitted"} <= set(titles)

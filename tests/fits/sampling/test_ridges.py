@@ -42,6 +42,7 @@ def assert_quantiles(posterior, levels, name="base.albedo"):
     np.testing.assert_allclose(np.mean(values[:, None] < levels, axis=0), SHARES, atol=4 * 0.5 * error + 0.005)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", SEEDS)
 def test_albedo_times_scale(seed):
     """Only the product is known: uniform in albedo and log scale, albedo is uniform as far as the scale goes."""

@@ -88,6 +88,7 @@ def test_multiple_scattering_of_a_conductor_equals_published_walks(angle, alpha,
     np.testing.assert_allclose(metal(np.cos(np.radians(angle)), alpha, 1.0, 1.0), expected, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_multiple_scattering_equals_walks_that_no_table_was_fitted_to():
     rng = np.random.default_rng(5)
 
@@ -203,9 +204,8 @@ def test_derivatives_equal_differences(function, arguments):
         np.testing.assert_allclose(slope, (above - below) / (2 * step), rtol=2e-3, atol=2e-4)
 
 
-@pytest.mark.parametrize(
-    "function", [pytest.param(lambda *x: single(*x)[0], marks=pytest.mark.slow), escape_cone_share]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("function", [lambda *x: single(*x)[0], escape_cone_share])
 def test_reverse_derivatives_equal_forward_ones(function):
     x = jnp.array([0.6, 0.3, 0.8])
     reverse, forward = (jax.jit(mode(lambda x: function(*x)))(x) for mode in (jax.grad, jax.jacfwd))

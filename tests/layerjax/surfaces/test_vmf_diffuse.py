@@ -193,6 +193,7 @@ def test_reciprocity_and_single_precision():
     np.testing.assert_allclose(single[tame], forward[tame], rtol=5e-5, atol=5e-7)
 
 
+@pytest.mark.slow
 def test_gradients_against_differences():
     x = jnp.array([0.7, 0.35, 0.6, 1.1, 0.8])
 

@@ -77,6 +77,7 @@ def test_a_smooth_varnish_over_white_reflects_all(ior, alpha):
     np.testing.assert_allclose(reflected_by_varnish(ior, alpha, "auto"), 1.0, atol=STATED)
 
 
+@pytest.mark.slow
 def test_what_a_hazy_varnish_over_white_loses_is_what_single_facets_lose():
     solver = lj.AddingDoubling(facet_multiple_scattering=False)
     expected = reflected_by_varnish(1.5, 0.02, solver)

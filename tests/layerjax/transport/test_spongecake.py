@@ -78,6 +78,7 @@ def test_upside_down_and_lit_from_below_is_the_same(name):
     )
 
 
+@pytest.mark.slow
 def test_turned_about_the_normal_is_the_same():
     turn = np.array([[np.cos(1.1), -np.sin(1.1), 0.0], [np.sin(1.1), np.cos(1.1), 0.0], [0.0, 0.0, 1.0]])
     stack, (wi, wo) = STACKS["flakes over fibers"], pairs()
@@ -105,6 +106,7 @@ def test_white_where_nothing_absorbs(name):
     np.testing.assert_allclose(lj.evaluate(ready, wi, wo), lj.evaluate(lobes, wi, wo), rtol=5e-3)
 
 
+@pytest.mark.slow
 def test_upright_axes_are_no_axes():
     """Terms that turn with an axis vanish with its tilt: 1e-9 is its sine."""
     wi, wo = pairs()
@@ -123,6 +125,7 @@ def test_energies_of_channels_are_apart():
     np.testing.assert_allclose(sum(lj.albedo(stack, light, CAKE)) + lj.unscattered(stack, light), 1.0, atol=OFF[1])
 
 
+@pytest.mark.slow
 def test_gray_channels_are_one():
     wi, wo = pairs()
     one = lj.evaluate(lj.Stack([lj.Medium(2.0, 0.8, FLAKES.phase, f0=0.6)]), wi, wo, CAKE)
@@ -142,7 +145,8 @@ def test_nothing_is_added_where_nothing_scatters_twice():
     assert np.max(added[~slanting]) < 0.05
 
 
-@pytest.mark.parametrize("name", [pytest.param(name, marks=[pytest.mark.slow] * (name != "haze")) for name in STACKS])
+@pytest.mark.slow
+@pytest.mark.parametrize("name", STACKS)
 def test_error_is_what_the_tables_say(name):
     """Within the 95th percentile of the held-out materials of the record, and well below the first order alone."""
     record = load("spongecake")[f"{len(STACKS[name].layers)}-error"]

@@ -276,7 +276,8 @@ def test_bad_options_are_named(options, name):
         lj.AddingDoubling(**options)
 
 
-@pytest.mark.parametrize("name", ["haze", pytest.param("rough glass", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["haze", "rough glass"])
 def test_samples_have_the_albedo_as_mean_weight(name):
     stack = STACKS[name]
     prepared = lj.prepare(stack, lj.AddingDoubling(nodes=16, modes=16))

@@ -70,6 +70,7 @@ def test_agrees_with_the_walk_through_a_slab():
     np.testing.assert_array_less(np.abs(followed - walked), 4.5 * error + 0.01 * (walked + 0.1 * walked.mean()))
 
 
+@pytest.mark.slow
 def test_traced_directions_that_are_known():
     """The same values inside a program that takes the directions as arguments."""
     stack = STACKS["paint"]

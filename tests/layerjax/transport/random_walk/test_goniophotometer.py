@@ -59,7 +59,17 @@ def test_multiple_scattering_by_flakes(layers, up, down):
     agree(seen.orders[:, 1, 0], np.hypot(seen.orders_error[:, 1, 0], 5e-4), [up, down])
 
 
-@pytest.mark.parametrize("name", ["flakes", "fibers", "two flakes", "three tilted", "three tilted, from below", "haze"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "flakes",
+        "haze",
+        *(
+            pytest.param(name, marks=pytest.mark.slow)
+            for name in ("fibers", "two flakes", "three tilted", "three tilted, from below")
+        ),
+    ],
+)
 def test_single_scattering(name):
     layers, direction, up, down, straight = HEMISPHERES[name]
     seen = measure(lj.Stack(layers()), lj.direction(*direction))

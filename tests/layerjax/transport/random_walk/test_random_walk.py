@@ -134,7 +134,8 @@ def test_a_narrow_interface_is_found():
     assert abs(values[0] - expected) < 4 * errors[0] + 1e-4 * expected
 
 
-@pytest.mark.parametrize("coated", [False, pytest.param(True, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("coated", [False, True])
 def test_a_narrow_metal_is_found(coated):
     # a perfect mirror shows its surroundings once more: half of a stack that is the same from both sides
     half, whole = haze(0.3, 0.7, 0.8), haze(0.3, 1.4, 0.8)
@@ -173,6 +174,7 @@ def transmittance_of_isotropic_slab(thickness, cells=1000):
     return np.exp(-thickness) + 0.5 * np.sum(collisions * np.diff(out))
 
 
+@pytest.mark.slow
 def test_a_naive_stop_is_biased_and_this_one_is_not():
     # what takes long gets lost if the walk stops after a number of steps and counts what is done
     assert abs(transmittance_of_isotropic_slab(1.0) - 0.65867) < 1e-5  # van de Hulst 1980
@@ -210,6 +212,7 @@ def test_sums_in_single_precision_do_not_drift():
     np.testing.assert_allclose(found, np.float32(0.3), rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_keys():
     stack = lj.Stack([lj.Interface(1.4, 0.3), haze(0.2, 1.0, 0.8)], lj.Lambertian(0.5))
     walk = lj.RandomWalk(paths=100)

@@ -87,6 +87,7 @@ def test_haze_behind_an_index_spreads_transmitted_light_alike_from_either_side()
         np.testing.assert_allclose(once, roughness(phase_variance(jnp.asarray(0.9))), rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_albedo_of_a_coated_diffuse_base():
     """Walks over 1.5/.1 on .9; errors of the energies (2e-3) and of the walk (1e-4)."""
     reflected, _ = lj.albedo(DIFFUSE, LIGHT[[0, 2]], FORWARD)

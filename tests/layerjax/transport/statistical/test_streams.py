@@ -87,9 +87,11 @@ MILK = lj.Medium(3.0, 1.0, lj.HenyeyGreenstein(0.8))
 @pytest.mark.parametrize(
     "layers",
     [
-        [COAT, MILK, INNER],
         [MILK],
-        *(pytest.param(n, marks=pytest.mark.slow) for n in ([COAT, INNER], [MILK, COAT, MILK])),
+        *(
+            pytest.param(layers, marks=pytest.mark.slow)
+            for layers in ([COAT, MILK, INNER], [COAT, INNER], [MILK, COAT, MILK])
+        ),
     ],
 )
 def test_nothing_is_lost(layers) -> None:
