@@ -159,7 +159,7 @@ class Prediction:
             raise ValueError("scores: a Geometry was predicted; predict Measurements to score them")
         return scores(self, self.measurements)
 
-    def _at(self, rows: NDArray[np.bool_]) -> "Prediction":
+    def _select(self, rows: NDArray[np.bool_]) -> "Prediction":
         """The prediction at some of its pairs of directions, (M,)."""
         names = ("values", "means", "scales", "softness", "discrepancy_sd")
         by_pair = {name: one[..., rows, :] for name in names if (one := getattr(self, name)) is not None}
@@ -235,7 +235,7 @@ def scores(prediction: Prediction, measurements: Measurements, rows: NDArray[np.
     chosen = np.ones(len(used), bool) if rows is None else rows
     if not chosen.any():
         raise ValueError("scores: there is no measurement to score")
-    values, prediction = used.values[chosen], prediction._at(chosen)
+    values, prediction = used.values[chosen], prediction._select(chosen)
     rank, magnitude = prediction.cdf(values), np.maximum(np.abs(values), np.finfo(float).tiny)
     predicted = (prediction.median, prediction.latent.mean)
     error, model_error = (np.abs(one - values) / magnitude for one in predicted)

@@ -37,7 +37,7 @@ CASES = [(name, stack, ABOVE) for name, stack in (STACKS | OPAQUE).items()]
 CASES += [(name, STACKS[name], BELOW) for name in ("surface, tilted", "fiber, in the plane", "haze", "three layers")]
 CASES += [(name, OPAQUE[name], GRAZING) for name in ("oren-nayar", "conductor")]
 QUICK = ("lambertian", "oren-nayar", "conductor", "haze", "haze, from below")
-"""The others are slow: they draw in the same ways."""
+"""The others, among them all with tilted axes or several layers, are slow."""
 CASES = [
     pytest.param(*case, id=f"{case[0]}, theta {case[2][0]}", marks=[pytest.mark.slow] * (named not in QUICK))
     for case in CASES
