@@ -78,7 +78,8 @@ def numbers(name, kind, dtype):
 
 def drawn(name, kind, dtype):
     """Directions drawn, their densities and weights, and the albedo."""
-    stack, transport = rounded(STACKS[kind]), CASES[name][0]
+    # a stack is solved in the precision of its numbers
+    stack, transport = jax.tree.map(lambda leaf: leaf.astype(dtype), rounded(STACKS[kind])), CASES[name][0]
     wi = pairs(stack)[0].astype(dtype)
     return *lj.sample(stack, wi, jax.random.key(5), transport), *lj.albedo(stack, wi[:1], transport, nodes=8)
 
