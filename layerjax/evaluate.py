@@ -72,7 +72,9 @@ def evaluate(
     Returns:
         Values of shape ``broadcast(wi, wo)[:-1] + (C,)``, for a map ``broadcast(S, wi[..., 0], wo[..., 0]) + (C,)``, in
         the floating type of the directions. A direction in the tangent plane gives 0. The resolution of `"auto"` and
-        `AddingDoubling` is the same for all texels of a map: that of the texel that needs the finest.
+        `AddingDoubling` is the same for all texels of a map: that of the texel that needs the finest. `AddingDoubling`
+        solves a stack in the precision of its numbers: one made in single precision stays so under directions in
+        double precision.
     """
     return evaluate_known(stack, wi, wo, transport, side=side, key=key)
 

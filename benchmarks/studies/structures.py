@@ -72,9 +72,9 @@ over a diffuse base and a metal make, up to three layers. Data and fits are by `
 scattering by their moments: this judges the search, not how well a transport describes a material.
 
 {rows}
-*first*, *first three*: how often the true structure is ranked there. *beaten*: how often a wrong one has a higher elpd
-by more than chance (see `ModelScore.clear_diff`). *too complex*: how often such a one has more layers. *time*: of a
-search on one core.
+*first*, *first three*: how often the true structure is ranked there. *wrong preferred*: how often another structure has
+a higher elpd by more than chance (see `ModelScore.clear_diff`); *too complex*: how often that one has more layers.
+*fitted*: structures fitted in a search, *time*: that of a search on one core, both in the median.
 
 The true structure is among the first three in {found} of {repeats} (required: {wanted} of {required}); a more complex
 one is preferred by more than chance in {complex}.
@@ -101,7 +101,7 @@ class Repeat:
         return self.truth.count("/")
 
     @property
-    def is_beaten(self) -> bool:
+    def is_wrong_preferred(self) -> bool:
         """Whether another structure is preferred by more than chance."""
         return self.clear_diff is None or self.clear_diff > 0.0
 
@@ -182,9 +182,11 @@ def run_repeat(index: int) -> Repeat:
 
 def _save(done: list[Repeat], directory: Path) -> tuple[str, tuple[Path, Path]]:
     surroundings = environment.describe()
-    by_layers = {f"{count} layers": [one for one in done if one.layers == count] for count in (1, 2, 3)}
+    by_layers = {
+        f"{count} layer{'s' * (count > 1)}": [one for one in done if one.layers == count] for count in (1, 2, 3)
+    }
     rows = [_row(kind, found) for kind, found in (by_layers | {"all": done}).items() if found]
-    heads = ("true stack", "materials", "first", "first three", "beaten", "too complex", "fitted", "time")
+    heads = ("true stack", "materials", "first", "first three", "wrong preferred", "too complex", "fitted", "time")
     text = TEXT.format(
         environment=environment_lines(surroundings),
         repeats=len(done),
@@ -205,14 +207,14 @@ def _among_first(one: Repeat) -> bool:
 
 
 def _too_complex(one: Repeat) -> bool:
-    return one.is_beaten and one.best.count("/") > one.layers
+    return one.is_wrong_preferred and one.best.count("/") > one.layers
 
 
 def _row(kind: str, repeats: list[Repeat]) -> tuple[str, ...]:
     counts = (
         sum(one.place == 0 for one in repeats),
         sum(map(_among_first, repeats)),
-        sum(one.is_beaten for one in repeats),
+        sum(one.is_wrong_preferred for one in repeats),
         sum(map(_too_complex, repeats)),
     )
     fitted, seconds = (float(np.median([getattr(one, name) for one in repeats])) for name in ("fitted", "seconds"))
