@@ -53,7 +53,7 @@ JITTERY = {
     ("Statistical", "dyed varnish"),
     ("Statistical", "two coats on paint"),
     ("Statistical", "hazy coat on metal"),
-    ("Statistical, forward", "plate"),
+    ("Statistical", "plate"),
 }
 """At equal indices caps of facets coincide, and tables go by a cube root: values jitter there by 3e-3 of the brightest
 under a dyed varnish, by 3e-4 under two coats and 5e-5 elsewhere, or step by 2e-5 times the root of what the indices
@@ -106,8 +106,8 @@ KINDS = {
         "clear plate",
     ),
     "AddingDoubling, multiple": ("coated metal",),
-    "Statistical": ("dyed varnish", "varnish on rough paint", "two coats on paint", "hazy coat on metal"),
-    "Statistical, forward": ("plate",),
+    "Statistical": ("dyed varnish", "varnish on rough paint", "two coats on paint", "hazy coat on metal", "plate"),
+    "Statistical, forward": ("coated metal",),
     "Statistical, single": ("varnish",),
 }
 """Structures whose layers and bases each transport handles by different code. Bases alone have one code, whatever the
