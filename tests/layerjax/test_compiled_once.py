@@ -87,7 +87,6 @@ def carried(name, transport, call):
     return True
 
 
-@pytest.mark.parametrize("dtype", [np.float32, pytest.param(np.float64, marks=pytest.mark.slow)])
 @pytest.mark.parametrize(
     ("name", "transport", "call"),
     [
@@ -100,18 +99,44 @@ def carried(name, transport, call):
         ("flakes", "single", "albedo"),
     ],
 )
-def test_second_call_compiles_nothing(name, transport, call, dtype):
-    check(name, transport, call, dtype)
+def test_second_call_compiles_nothing(name, transport, call):
+    check(name, transport, call, np.float32)
+
+
+@pytest.mark.parametrize("name", ONE)
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_the_same_transport_is_chosen(name, dtype):
+    one, other = (lj.choose_transport(each[name], *directions(dtype)) for each in (ONE, OTHER))
+    assert one == other
+
+
+CASES = {
+    "single": ("flakes", "haze"),
+    "spongecake": ("haze", "flakes"),
+    "statistical": ("hazy coat", "slab", "dyed metal"),
+    "statistical exact": ("coat",),
+    "statistical lobe": ("coat",),
+    "endf": ("dyed metal", "map"),
+    "weidlich wilkie": ("map", "rough paint"),
+    "adding": ("slab", "map", "flakes", "rough paint"),
+    "adding multiple": ("dyed metal", "coat"),
+    "walk": ("slab", "hazy coat"),
+    "auto": ("coat", "slab", "flakes"),
+}
+"""Structures that each transport handles by different code: every call of the first, values of the others."""
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
-@pytest.mark.parametrize("transport", TRANSPORTS)
-@pytest.mark.parametrize("name", ONE)
-def test_no_second_call_compiles_anything(name, transport, dtype):
-    if transport == "auto":
-        chosen = [lj.choose_transport(stacks[name], *directions(dtype)) for stacks in (ONE, OTHER)]
-        assert chosen[0] == chosen[1]
-    for call in CALLS:
+@pytest.mark.parametrize(
+    ("name", "transport", "calls", "dtype"),
+    [
+        pytest.param(name, transport, ("evaluate",) if place else tuple(CALLS), dtype, id=f"{transport}: {name}")
+        for row, (transport, names) in enumerate(CASES.items())
+        for place, name in enumerate(names)
+        for dtype in [(np.float32, np.float64)[(row + place) % 2]]
+    ],
+)
+def test_no_second_call_compiles_anything(name, transport, calls, dtype):
+    for call in calls:
         if carried(name, transport, call):
             check(name, transport, call, dtype)

@@ -123,7 +123,6 @@ def test_reciprocity():
         (np.float32, "values"),
         (np.float64, "values"),
         (np.float32, "draws"),
-        (np.float64, "draws"),
     ],
 )
 def test_values_and_gradients_are_finite(dtype, what):
@@ -239,8 +238,7 @@ def test_one_bounce_energies_of_the_walk_in_numpy():
 
 
 COPPER = 0.2 + 3.9j  # dark enough for what is trapped under the interface to die out in few bounces
-CASES = [(1.5, 100.0, 100.0, 30), (1.5, 1e4, 1e3, 60), (1.5, 1e3, 30.0, 0), (2.0, 1e4, 10.0, 45), (1.5, 3.0, 2.0, 75)]
-CASES += [(1.5, 30.0, None, 20), (1.5, 3.0, None, 70)]
+CASES = [(1.5, 100.0, 100.0, 30), (2.0, 1e4, 10.0, 45), (1.5, 3.0, 2.0, 75), (1.5, 30.0, None, 20)]
 
 
 @pytest.mark.slow
@@ -259,9 +257,6 @@ def test_both_references_have_the_energy_of_the_walk_in_numpy(eta, top, base, de
 
 
 STACKS = {
-    "metal": lj.Stack([face(1.5, 30.0)], metal(100.0, (0.2, 3.9))),
-    "diffuse": lj.Stack([face(1.5, 3.0)], lj.Lambertian(0.8)),
-    "narrow on wide": lj.Stack([face(1.5, 1e4)], metal(0.02, (0.2, 3.9))),
     "both distributions": lj.Stack([lj.Interface(1.4, 0.2), lj.Medium(0.3, 0.9), face(1.7, 20.0)], lj.Lambertian(0.5)),
     "slab": lj.Stack([face(1.5, 50.0), lj.Medium(0.3, 0.9), face(1.0, 10.0)]),
     "less inside": lj.Stack([face(0.6, 50.0)], metal(10.0, (0.2, 3.9))),
@@ -282,9 +277,9 @@ def test_walk_and_solver_agree(name):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_references_are_finite_over_the_box(dtype):
+def test_references_are_finite_over_the_box():
     """kappa from 1e-2 to 1e8 above and below, light that is refracted to either side of the critical angle."""
+    dtype = np.float32
     wi = lj.direction(jnp.array([0.0, 0.6, 1.2, 1.56, 2.0, 3.1]), 0.3).astype(dtype)
     wo = lj.direction(jnp.array([0.0, 1.1, 1.57, 2.5]), 2.0).astype(dtype)[:, None]
 
@@ -305,9 +300,9 @@ def test_references_are_finite_over_the_box(dtype):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("transport", [lj.AddingDoubling(nodes=4, modes=4), "auto"], ids=["4", "auto"])
-def test_reverse_mode_of_a_varnish(transport):
+def test_reverse_mode_of_a_varnish():
     """Against central differences of the same resolution."""
+    transport = lj.AddingDoubling(nodes=4, modes=4)
 
     @jax.jit
     def both(x, wi, wo):
@@ -327,9 +322,8 @@ def test_reverse_mode_of_a_varnish(transport):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("nodes_and_modes", [(6, 8), (12, 16)])
-def test_slopes_of_a_coat_are_those_of_a_fine_resolution(nodes_and_modes):
-    """At resolutions that are chosen for it: values to 1e-3, slopes by width and index to 1 %, and equal to
+def test_slopes_of_a_coat_are_those_of_a_fine_resolution():
+    """At the resolution that is chosen for it: values to 1e-3, slopes by width and index to 1 %, and equal to
     differences."""
     wi, wo = lj.direction(np.deg2rad(20.0), 0.0), lj.direction(np.deg2rad([3.0, 25.0, 50.0, 60.0, 75.0]), np.pi)
 
@@ -341,7 +335,7 @@ def test_slopes_of_a_coat_are_those_of_a_fine_resolution(nodes_and_modes):
 
         return jax.jit(lambda *given: jax.jacfwd(values, (0, 1), has_aux=True)(*given))
 
-    coarse, fine = program(*nodes_and_modes), program(24, 32)
+    coarse, fine = program(6, 8), program(24, 32)
     for alpha in (0.1, 0.3, 1.0):
         for ior in (1.2, 1.5):
             slopes, found = coarse(alpha, ior)

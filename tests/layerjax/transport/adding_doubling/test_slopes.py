@@ -1,14 +1,13 @@
 """Slopes of `AddingDoubling`, by every continuous parameter of random stacks of every structure.
 
 Forward and reverse mode agree with each other and with differences of values at the same resolution: no point of a
-quadrature crosses an edge of what it sums, so that values are no staircase. At the default resolution slopes are those
-of a finer one.
+quadrature crosses an edge of what it sums, so that values are no staircase. Slopes at the default resolution:
+`test_traced_stacks` and, of von Mises-Fisher normals, `test_vmf_interfaces`.
 
 Slopes are by the parameter itself, of widths and thicknesses by its share. They are compared relative to |f|, or to
 `FLOOR` of the largest |f| of the pairs.
 """
 
-import dataclasses
 from functools import cache
 
 import jax
@@ -33,10 +32,6 @@ OTHERS = {
     "vmf coat on metal": (
         (1.5, 0.3, 0.3),
         lambda p: lj.Stack([lj.Interface(p[0], p[1], "vmf")], lj.Conductor(0.2, 3.5, p[2], "vmf")),
-    ),
-    "vmf coat on paint": (
-        (1.5, 0.3, 0.5),
-        lambda p: lj.Stack([lj.Interface(p[0], p[1], "vmf")], lj.Lambertian(p[2])),
     ),
     "two coats on metal": (
         (1.5, 0.3, 1.2, 0.2),
@@ -97,7 +92,7 @@ def relative_to(f):
     return np.maximum(np.abs(f), FLOOR * np.max(np.abs(f)))
 
 
-def wrong(kind, numbers, transport, known=True, reverse=True):
+def wrong(kind, numbers, transport, known=True, reverse=False):
     """Where analytic slopes are not those of differences to 1e-4, or of the other mode to 1e-7."""
     run, values = program(kind, transport, known, reverse)
     f, forward, _ = run(numbers, np.ones(len(pairs(kind)[0])))
@@ -123,37 +118,23 @@ def wrong(kind, numbers, transport, known=True, reverse=True):
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", [*STRUCTURES, *OTHERS])
 def test_slopes_are_those_of_differences(kind):
-    found = list(wrong(kind, numbers_of(kind, 0), SHORT, reverse=kind in REVERSE))
+    """Of eight stacks of a structure."""
+    found = [
+        line
+        for seed in range(8 if kind in STRUCTURES else 1)
+        for line in wrong(kind, numbers_of(kind, seed), SHORT, reverse=kind in REVERSE)
+    ]
     assert not found, "\n".join(found)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("known", [True, False])
-@pytest.mark.parametrize("kind", STRUCTURES)
-def test_slopes_of_many_stacks_are_those_of_differences(kind, known):
+@pytest.mark.parametrize("kind", ["varnish", "haze on metal"])
+def test_slopes_along_given_directions_are_those_of_differences(kind):
+    """At twice the resolution, where directions are not known while tracing."""
     transport = lj.AddingDoubling(nodes=12, modes=16)
-    found = [line for seed in range(20) for line in wrong(kind, numbers_of(kind, seed), transport, known)]
-    assert not found, "\n".join(found)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", [*STRUCTURES, "vmf coat on paint"])
-def test_slopes_at_the_default_resolution(kind):
-    """To 1 % of |f| of those at twice the nodes and modes. By the width of von Mises-Fisher normals the slope had been
-    0.0093 where 0.0253 is right."""
-    wi, wo = pairs(kind)
-    found = []
-    for seed in range(4 if kind in STRUCTURES else 1):
-        numbers = numbers_of(kind, seed)
-        usual = lj.choose_transport(build_of(kind)(numbers), wi, wo)
-        fine = dataclasses.replace(usual, nodes=2 * usual.nodes, modes=min(2 * usual.modes, 96))
-        ones = np.ones(len(wi))
-        (f, slopes, _), (_, fine_slopes, _) = (
-            program(kind, one, True, False)[0](numbers, ones) for one in (usual, fine)
-        )
-        off = np.max(np.abs(fine_slopes - slopes) / relative_to(f)[:, None], axis=0) * lengths(
-            build_of(kind)(numbers), numbers
-        )
-        if not np.all(off <= 1e-2):
-            found.append(f"{usual.nodes} x {usual.modes}: off by {off} of |f| at {numbers}")
+    found = [
+        line
+        for seed in range(4)
+        for line in wrong(kind, numbers_of(kind, seed), transport, known=False, reverse=kind in REVERSE)
+    ]
     assert not found, "\n".join(found)

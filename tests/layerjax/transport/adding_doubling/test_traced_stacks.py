@@ -46,18 +46,16 @@ def test_a_coated_metal_under_jit():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("part", range(3))
 @pytest.mark.parametrize("kind", STRUCTURES)
-def test_transformations_keep_values(kind, part):
-    """Two hundred stacks: jitted, where nothing is known of them, and two of each structure under `vmap`."""
+def test_transformations_keep_values(kind):
+    """Of three stacks of a structure: jitted, where nothing is known of them, and two of them under `vmap`."""
     values = values_of(kind)
-    jitted = jax.jit(values)
-    for seed in range(part, 29, 3):
-        numbers = drawn(kind, seed)
-        assert_near(jitted(numbers), values(numbers), 2.0 * TOLERANCE)
-    some = jnp.stack([drawn(kind, seed) for seed in (part, part + 3)])
-    for row, numbers in zip(jax.vmap(values)(some), some, strict=True):
-        assert_near(row, values(numbers), 2.0 * TOLERANCE)
+    some = [drawn(kind, seed) for seed in range(3)]
+    plain, jitted = [values(numbers) for numbers in some], jax.jit(values)
+    for numbers, value in zip(some, plain, strict=True):
+        assert_near(jitted(numbers), value, 2.0 * TOLERANCE)
+    for row, value in zip(jax.vmap(values)(jnp.stack(some[:2])), plain, strict=False):
+        assert_near(row, value, 2.0 * TOLERANCE)
 
 
 def slopes_by_each(kind, numbers, transport="auto"):
@@ -72,12 +70,11 @@ def slopes_by_each(kind, numbers, transport="auto"):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("kind", STRUCTURES)
-def test_values_and_slopes_under_grad(kind, seed):
+def test_values_and_slopes_under_grad(kind):
     """Slopes by each parameter are right to 1 % of the values, by widths and thicknesses for a change by their share:
     by itself a width of 0.05 changes values 20 times as much."""
-    numbers = drawn(kind, seed)
+    numbers = drawn(kind, 2)
     plain = values_of(kind)(numbers)
     differentiated, slopes = slopes_by_each(kind, numbers)
     assert_near(differentiated, plain, 1e-8)  # the same resolution: rounding of nearly conserving slabs alone
