@@ -15,7 +15,7 @@ from tests.helpers.models import LINE, LOBE, LOBE_STACK, directions, line, line_
 from tests.helpers.places import COATINGS, EXAMPLES
 from tests.helpers.stores import keys
 
-STEEL = COATINGS / "nite_on_blasted_steel1008_650nm_inplane.csv"
+STEEL = read(COATINGS / "nite_on_blasted_steel1008_650nm_inplane.csv").select(incidence=(10.0, 50.0))
 
 
 def cost_at(problem, values):
@@ -27,13 +27,13 @@ def cost_at(problem, values):
 @pytest.mark.slow
 def test_a_stack_never_ends_above_what_it_contains():
     """A haze over flakes on paint: the flakes on paint, beside steel."""
-    data, ends = read(STEEL).select(incidence=(10.0, 50.0)), {}
+    ends = []
     for name in ("hazy_coat_over_diffuse", "flake_coat_over_diffuse"):
         given = read_problem(EXAMPLES / f"{name}.toml")
         # the cheapest transport: what is asked is about starts, whatever carries the light
         options = {"transport": lj.SingleScattering(), "noise": given.noise, "scale": given.scale}
-        ends[name] = fit(given.stack, data, starts=8, **options)
-    whole, part = ends.values()
+        ends.append(fit(given.stack, STEEL, starts=8, **options))
+    whole, part = ends
     values = {name.replace("layers[0]", "layers[1]"): value for name, value in part.values.items()}
     # to what a start that goes on is worth
     assert whole.minima[0].cost <= cost_at(whole.problem, values) + LEAST_GAIN
@@ -42,9 +42,8 @@ def test_a_stack_never_ends_above_what_it_contains():
 def test_a_race_ends_where_all_starts_do(monkeypatch):
     """Of a stack with several minima; few steps tell which starts go on, and the others are not followed."""
     given = read_problem(EXAMPLES / "hazy_coat_over_diffuse.toml")
-    data = read(STEEL).select(incidence=(10.0, 50.0))
-    problem = Problem(given.stack, data, lj.SingleScattering(), replace(given.noise, discrepancy=False), given.scale)
-    points = starts_module.start_points(problem, 8, 0)
+    problem = Problem(given.stack, STEEL, lj.SingleScattering(), replace(given.noise, discrepancy=False), given.scale)
+    points = start_points(problem, 8, 0)
     monkeypatch.setattr(starts_module, "EARLY", 10)
     ends = starts_module.screened_starts(problem, points)
     every = multi_start(problem, points, lambda *_: None)

@@ -10,8 +10,8 @@ from scipy.special import logsumexp
 
 from fits import ComparisonOptions, Fit, Measurements, Noise, Problem, average, compare, fit, predict, slices
 from fits.prediction.cross_validation import CrossValidation, cross_validate, rank_models, stacking, without
-from fits.prediction.evidence import Evidence, evidence, posterior_draws
-from fits.problem.parameters import Free, LogUniform, Normal
+from fits.prediction.evidence import Evidence, evidence
+from fits.problem.parameters import Free, Normal
 from fits.reports import tables
 from tests.helpers.models import LINE, along, line
 
@@ -89,21 +89,6 @@ def test_errors_by_few_draws_are_told(found: Fit) -> None:
     assert np.all(finer.errors <= 0.1)
     assert np.max(rough[0].errors) > 0.1
     assert finer.elpd == pytest.approx(sum(exact), abs=4.0 * finer.error)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("known", [False, True])
-def test_held_out_data_of_a_ridge_are_predicted(known: bool) -> None:
-    """Only the product of a level and a scale is identified; draws of the whole posterior follow the ridge."""
-    level = replace(DATA, values=1.0 + DATA.values - EXACT)
-    ridge_fit = fitted({"a": Free(0.5, 0.0, 1.0), "b": 0.0}, level, scale=Free(1.0, 0.1, 10.0, LogUniform()))
-    initial = posterior_draws(ridge_fit).mixture if known else None
-    left = cross_validate(ridge_fit, draws=2000, initial=initial)
-    for rows in left.rows:
-        others = np.setdiff1d(np.arange(len(level)), rows)
-        values, width = level.values[:, 0], SIGMA * np.sqrt(1.0 + 1.0 / len(others))
-        expected = stats.norm.logpdf(values[rows], values[others].mean(), width)
-        np.testing.assert_allclose(left.log_density[rows, 0], expected, atol=0.05)
 
 
 def test_measurements_in_no_group_do_not_count() -> None:

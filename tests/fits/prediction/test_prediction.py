@@ -94,16 +94,6 @@ def test_directions_below_an_opaque_stack_are_refused(coat_fit: Fit) -> None:
     assert np.all(predict(coat_fit, slices([89.9]), draws=8).mean > 0.0)
 
 
-@pytest.mark.slow
-def test_right_models_lose_little_by_it() -> None:
-    fitted, held_out = split(1, 0.0)
-    found = fitted_to(fitted)
-    assert found.values["noise.discrepancy.amplitude"] < SIGMA
-    got = predict(found, held_out).scores
-    assert got.coverage[0.95] > 0.9
-    assert got.median_error < SIGMA
-
-
 def test_noise_elsewhere_is_that_of_what_was_fitted() -> None:
     fitted, _ = split(2, 0.0)
     known = replace(fitted, sigma=SIGMA * fitted.values)

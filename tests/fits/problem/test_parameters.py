@@ -1,6 +1,6 @@
 """Free parameters: what is refused, priors against scipy, transforms against calculus, channels that are tied."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import jax
@@ -65,10 +65,9 @@ def test_refused(call, message: str) -> None:
         call()
 
 
-@pytest.mark.parametrize("name", PRIORS)
-def test_prior_density_is_scipys(name: str) -> None:
+@pytest.mark.parametrize(("free", "reference"), PRIORS.values(), ids=PRIORS)
+def test_prior_density_is_scipys(free: Free, reference: Callable) -> None:
     """Within the bounds, -inf outside; over the unconstrained vector it integrates to 1 if the determinant is right."""
-    free, reference = PRIORS[name]
     box = Box.of([free])
     values = np.linspace(free.low, free.high, 11)[1:-1]
     ours = [float(box.log_prior(jnp.array([value]))) for value in values]

@@ -53,11 +53,12 @@ autocorrelation = 0.4
 INSTRUMENT = Instrument(detector_aperture=2.0, tilt=Free(0.0, -1.0, 1.0))
 BASE = 'base = { kind = "Lambertian", albedo = 0.5 }\n'
 LAYER = "[[layers]]\nkind = 'Medium'\n"
+THIN = LAYER + "thickness = 1\n"
 
 
-def read(tmp_path: Path, text: str):
+def read(tmp_path: Path, text: str | bytes):
     path = tmp_path / "problem.toml"
-    path.write_text(text)
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
     return read_problem(path)
 
 
@@ -135,7 +136,11 @@ def test_dictionary_round_trip():
 FREE = LAYER + "thickness = {{ start = 1, low = 0, high = 2{} }}\n"
 WRONG = {
     "": "neither a layer nor a base",
-    LAYER + "thickness = 1\nalbdo = 0.5\n": r"layers\[0\] has an unknown key 'albdo' \(did you mean 'albedo'\?\); allo",
+    b"\xef\xbb\xbf": "neither a layer nor a base",
+    BASE.encode("utf-16"): r"not a text file \(byte 0 is not UTF-8\)",
+    "base." + "a." * 2000 + "b = 1\n": "base has no kind",
+    "about = { day = 2020-13-01 }\n": "not valid TOML: ",
+    THIN + "albdo = 0.5\n": r"layers\[0\] has an unknown key 'albdo' \(did you mean 'albedo'\?\); allo",
     BASE + "bse = 3\n": "the file has an unknown key 'bse'",
     LAYER + "thickness = -1\n": r"layers\[0\]: Medium.thickness: -1 is outside \[0, 10000\]",
     LAYER + "albedo = 0.5\n": r"layers\[0\] has no thickness, which Medium needs",
@@ -146,17 +151,13 @@ WRONG = {
     FREE.replace(", high = 2", "").format(""): r"layers\[0\].thickness has no high, which Free needs",
     FREE.replace("high = 2", "high = 1e6").format(""): r"layers\[0\].thickness.high is 1000000.0, must be a number in",
     FREE.format(", prior = { kind = 'Normal', mean = 1, sd = -1 }"): r"layers\[0\].thickness.prior: Normal.sd is -1",
-    LAYER
-    + "thickness = 1\nphase = { kind = 'SGGX', shape = 'ball', alpha = 0.1 }\n": r"layers\[0\].phase: SGGX.shape: ",
+    THIN + "phase = { kind = 'SGGX', shape = 'ball', alpha = 0.1 }\n": r"layers\[0\].phase: SGGX.shape: ",
     BASE + "noise = { discrepancy = { length_half = -3.0 } }\n": "noise.discrepancy.length_half is -3.0",
     BASE + "scale = { start = [1, 1], low = 0.5, high = 2 }\n": "scale has 2 channels, must be one number for all",
     BASE + "instrument = { detector_aperture = 31 }\n": r"instrument.detector_aperture is 31; .* in \[0, 30\]",
-    BASE
-    + "instrument = { floor = { start = 1, low = 0, high = 2 } }\n": "instrument.floor.low is 0.0; .* in .1e-100, ",
+    BASE + "instrument.floor = { start = 1, low = 0, high = 2 }\n": "instrument.floor.low is 0.0; .* in .1e-100, ",
     BASE + "transport = 'Singlescattering'\n": "transport is 'Singlescattering' .did you mean 'SingleScattering'",
-    "[base]\nkind = 'Lambertian'\nalbedo = [0.1, 0.2]\n"
-    + LAYER
-    + "thickness = [1, 2, 3]\n": "disagree on the number of",
+    BASE.replace("0.5", "[0.1, 0.2]") + LAYER + "thickness = [1, 2, 3]\n": "disagree on the number of",
 }
 
 
@@ -166,23 +167,6 @@ def test_bad_files_are_one_line_that_names_the_place(tmp_path, text):
         read(tmp_path, text)
     assert str(caught.value).startswith(str(tmp_path / "problem.toml"))
     assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize(
-    ("content", "words"),
-    [
-        (b"\xef\xbb\xbf", "there is neither a layer nor a base"),
-        (BASE.encode("utf-16"), "not a text file (byte 0 is not UTF-8)"),
-        (b"base." + b"a." * 2000 + b"b = 1\n", "base has no kind"),
-        (b"about = { day = 2020-13-01 }\n", "not valid TOML: "),
-    ],
-)
-def test_files_that_hold_something_else(tmp_path: Path, content: bytes, words: str) -> None:
-    path = tmp_path / "stack.toml"
-    path.write_bytes(content)
-    with pytest.raises(ValueError) as caught:  # noqa: PT011 (parentheses in what is looked for)
-        read_problem(path)
-    assert words in str(caught.value)
     with pytest.raises(ValueError, match="is a directory, must be a file"):
         read_problem(tmp_path)
 

@@ -13,7 +13,7 @@ import pytest
 import layerjax as lj
 from fits import Instrument
 from fits._files import locked
-from fits.optimise.result import Fit, Minimum
+from fits.optimise.result import Fit, Minimum, WithoutDiscrepancy
 from fits.optimise.uncertainty import Direction
 from fits.problem.noise import Noise
 from fits.problem.parameters import Free, LogNormal
@@ -22,17 +22,17 @@ from fits.reports.results import load_fit, load_posterior, save_fit, save_poster
 from fits.sampling.sample import load, sample
 from tests.helpers.files import contents
 
-STORED = ("vector", "errors", "covariance", "cost", "condition_number")
+ARRAYS = ("vector", "errors", "covariance", "cost", "condition_number")
+SAME = ["at_bound", "converged", "status", "iterations", "unidentified", "units", "values", "without_discrepancy"]
 
 
 def assert_same(loaded: Fit, saved: Fit) -> None:
-    for name in STORED:
+    for name in ARRAYS:
         np.testing.assert_array_equal(getattr(loaded, name), getattr(saved, name), err_msg=name)
-    for name in ("at_bound", "converged", "status", "iterations", "unidentified", "units", "values"):
+    for name in SAME:
         assert getattr(loaded, name) == getattr(saved, name), name
     assert [one.values for one in loaded.minima] == [one.values for one in saved.minima]
     assert len(loaded.alternatives) == len(saved.alternatives)
-    assert loaded.problem.names == saved.problem.names
     np.testing.assert_array_equal(loaded.problem.low, saved.problem.low)
     before, after = saved.problem.data, loaded.problem.data
     for name in ("source", "channels", "mask", "values", "sigma"):
@@ -50,19 +50,23 @@ def unfitted(coat_fit: Fit, **settings: Any) -> Fit:
     direction = Direction(np.inf, {problem.names[0]: 1.0}, {problem.names[0]: np.inf})
     found = {"vector": problem.start, "errors": np.full(len(problem.start), 0.1), "unidentified": (direction,)}
     found |= {"covariance": 0.01 * np.eye(len(problem.start)), "minima": (minimum,)}
+    if problem.noise.discrepancy:
+        before = WithoutDiscrepancy(coat_fit.values, coat_fit.standard_errors, 30.0, 20, 12.5, 0.4, 19)
+        found["without_discrepancy"] = before
     return replace(coat_fit, problem=problem, **found)
+
+
+STUDENT = Noise(relative=0.02, floor=1e-4, use_sigma=False, tails="student", degrees_of_freedom=5.0)
 
 
 @pytest.mark.parametrize(
     "settings",
     [
         None,
-        {
-            "scale": Free(1.0, 0.8, 1.25, LogNormal(1.0, 0.05)),
-            "noise": Noise(relative=0.02, floor=1e-4, use_sigma=False, tails="student", degrees_of_freedom=5.0),
-        },
+        {"scale": Free(1.0, 0.8, 1.25, LogNormal(1.0, 0.05)), "noise": STUDENT},
         {"scale": 1.1, "objective": "cube_root", "transport": lj.SingleScattering()},
         {"instrument": Instrument(0.5, 1.0, Free(0.0, -2.0, 2.0), 0.03, 1e-3), "transport": lj.SingleScattering()},
+        {"noise": Noise(relative=0.03, discrepancy=True)},
     ],
 )
 def test_a_saved_fit_comes_back(coat_fit: Fit, tmp_path: Path, settings: dict[str, Any] | None) -> None:
@@ -163,21 +167,21 @@ def test_damage_to_a_result_is_seen(coat_fit: Fit, tmp_path: Path) -> None:
             with pytest.raises(ValueError, match=name):
                 load_fit(directory)
         path.write_bytes(whole)
-    content = json.loads((directory / "fit.json").read_text())
+    path, whole = directory / "fit.json", (directory / "fit.json").read_text()
+    content = json.loads(whole)
     content["fit"]["cost"] += 1e-9
-    for name, text, words in (
-        ("fit.json", json.dumps(content), r"fit\.json: damaged or changed"),
-        ("fit.json", '{"layerjax_result": 99}', "is version 99 of the format"),
-        ("fit.json", None, "no fit.json"),
-        ("data.csv", None, "data.csv"),
+    for text, words in (
+        (json.dumps(content), r"fit\.json: damaged or changed"),
+        ('{"layerjax_result": 99}', "is version 99 of the format"),
     ):
-        whole = (directory / name).read_text()
-        (directory / name).unlink()
-        if text is not None:
-            (directory / name).write_text(text)
-        with pytest.raises((ValueError, FileNotFoundError), match=words):
+        path.write_text(text)
+        with pytest.raises(ValueError, match=words):
             load_fit(directory)
-        (directory / name).write_text(whole)
+    path.write_text(whole)
+    for name in ("data.csv", "fit.json"):
+        (directory / name).unlink()
+        with pytest.raises(FileNotFoundError, match=name):
+            load_fit(directory)
 
 
 def test_what_killed_processes_left_is_tidied_up(coat_fit: Fit, tmp_path: Path) -> None:
