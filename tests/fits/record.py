@@ -22,11 +22,9 @@ import numpy as np
 
 import fits
 import layerjax as lj
+from tests.helpers.places import COATINGS, EXAMPLES
 
-ROOT = Path(__file__).parents[2]
-RECORD = ROOT / "tests" / "data" / "record.json"
-EXAMPLES = ROOT / "examples"
-COATINGS = EXAMPLES / "arizona_black_coatings"
+RECORD = Path(__file__).parents[1] / "data" / "record.json"
 STARTS = 4
 COATED = lj.Stack([lj.Interface(1.5, 0.2)], lj.Lambertian(0.4))
 GEOMETRY = fits.slices(incidence=(10.0, 40.0, 70.0), outgoing=np.arange(-80.0, 81.0, 10.0))
@@ -37,28 +35,6 @@ def of_fit(fit: Any) -> dict[str, Any]:
     found = {name: getattr(fit, name) for name in ("cost", "values", "standard_errors", "reduced_chi_square")}
     found["unidentified"] = [sorted(direction.weights) for direction in fit.unidentified]
     return found | {"at_bound": sorted(fit.at_bound), "insensitive": sorted(fit.insensitive)}
-
-
-def of_prediction(prediction: Any) -> dict[str, Any]:
-    """Means, intervals and scores of held-out data, at every tenth of the points."""
-    ends = {"mean": prediction.mean, "low": prediction.quantile(0.025), "high": prediction.quantile(0.975)}
-    found = {name: values[::10].ravel().tolist() for name, values in ends.items()}
-    return found | {"median_error": prediction.scores.median_error}
-
-
-def of_comparison(comparison: Any) -> dict[str, Any]:
-    """Ranking and elpd differences."""
-    scores = {row.name: row.model_score for row in comparison.rows}
-    columns = ("elpd_diff", "dse", "weight")
-    found = {column: {name: getattr(score, column) for name, score in scores.items()} for column in columns}
-    return found | {"ranking": list(scores)}
-
-
-def of_posterior(posterior: Any) -> dict[str, Any]:
-    """Quantiles of every parameter."""
-    quantiles = np.quantile(posterior.samples, (0.05, 0.5, 0.95), axis=0).T.tolist()
-    columns = {"quantiles": quantiles, "sd": posterior.samples.std(axis=0).tolist()}
-    return {name: dict(zip(posterior.names, column, strict=True)) for name, column in columns.items()}
 
 
 def example(name: str, data: Path, incidence: tuple[float, ...] | None = None) -> Any:
@@ -78,8 +54,10 @@ def held_out() -> dict[str, Any]:
     """A hazy coat on two incidences of a paint, and its prediction of the other two."""
     data = COATINGS / DATA["aeroglaze"]
     fit = example("coated_diffuse", data, (10.0, 50.0))
-    prediction = fits.predict(fit, fits.read(data).select(incidence=[30.0, 70.0]))
-    return of_fit(fit) | {"prediction": of_prediction(prediction)}
+    seen = fits.predict(fit, fits.read(data).select(incidence=[30.0, 70.0]))
+    ends = {"mean": seen.mean, "low": seen.quantile(0.025), "high": seen.quantile(0.975)}
+    every_tenth = {name: values[::10].ravel().tolist() for name, values in ends.items()}
+    return of_fit(fit) | {"prediction": every_tenth | {"median_error": seen.scores.median_error}}
 
 
 def joint() -> dict[str, Any]:
@@ -93,17 +71,13 @@ def slab() -> dict[str, Any]:
     """A slab by scans and by an integrating sphere."""
     import measured_quantities as quantities
 
-    solver = lj.AddingDoubling(nodes=8, modes=4)
-    noise = fits.Noise(relative=0.02, floor=1e-6)
-
     def of(mu_s: Any, mu_a: Any, g: Any) -> Any:
         return lj.Stack([lj.TurbidMedium(1.0, mu_s, mu_a, lj.HenyeyGreenstein(g))])
 
+    solver, noise = lj.AddingDoubling(nodes=8, modes=4), fits.Noise(relative=0.02, floor=1e-6)
     free = of(fits.Free(1.0, 0.1, 20.0), fits.Free(0.3, 0.0, 5.0), fits.Free(0.0, -0.9, 0.9))
-    parts = {
-        "scans": fits.Problem(free, quantities.simulated(of(2.0, 0.1, 0.5), solver), solver, noise),
-        "sphere": quantities.sphere(free, 0.30, 0.55, solver),
-    }
+    scans = fits.Problem(free, quantities.simulated(of(2.0, 0.1, 0.5), solver), solver, noise)
+    parts = {"scans": scans, "sphere": quantities.sphere(free, 0.30, 0.55, solver)}
     return of_fit(fits.fit(fits.Joint(parts, shared=["layers"]), starts=STARTS))
 
 
@@ -112,9 +86,8 @@ def mixture() -> dict[str, Any]:
     import measured_quantities as quantities
 
     def partly(covered: Any, alpha: Any) -> Any:
-        coat = lj.Stack([lj.Interface(1.5, 0.2)], lj.Lambertian(0.4))
         metal = lj.Stack([], lj.Conductor(0.2, 3.9, alpha))
-        return lj.Mixture({"coat": coat, "metal": metal}, {"coat": covered, "metal": None})
+        return lj.Mixture({"coat": COATED, "metal": metal}, {"coat": covered, "metal": None})
 
     data = quantities.simulated(partly(0.7, 0.35))
     return of_fit(quantities.fit(partly(fits.Free(0.5, 0.0, 1.0), fits.Free(0.3, 0.02, 1.0)), data, lj.Statistical()))
@@ -145,7 +118,10 @@ def structures() -> dict[str, Any]:
 def compared() -> dict[str, Any]:
     """Two stacks on one data set, by cross-validation."""
     found = {name: example(name, COATINGS / DATA["anoblack"]) for name in ("coated_diffuse", "rough_conductor")}
-    return of_comparison(fits.compare(found, refit=True))
+    scores = {row.name: row.model_score for row in fits.compare(found, refit=True).rows}
+    columns = ("elpd_diff", "dse", "weight")
+    numbers = {column: {name: getattr(score, column) for name, score in scores.items()} for column in columns}
+    return numbers | {"ranking": list(scores)}
 
 
 def posterior() -> dict[str, Any]:
@@ -153,7 +129,10 @@ def posterior() -> dict[str, Any]:
     free = lj.Stack([lj.Interface(fits.Free(1.4, 1.2, 2.2), fits.Free(0.3, 0.02, 1.0))], lj.Lambertian(0.4))
     data = fits.simulate(COATED, GEOMETRY, transport=lj.Statistical(), noise=0.05, seed=0)
     fit = fits.fit(free, data, transport=lj.Statistical(), noise=fits.Noise(relative=0.05), starts=STARTS)
-    return of_fit(fit) | of_posterior(fits.sample(fit, ess=2000))
+    drawn = fits.sample(fit, ess=2000)
+    quantiles = np.quantile(drawn.samples, (0.05, 0.5, 0.95), axis=0).T.tolist()
+    columns = {"quantiles": quantiles, "sd": drawn.samples.std(axis=0).tolist()}
+    return of_fit(fit) | {name: dict(zip(drawn.names, column, strict=True)) for name, column in columns.items()}
 
 
 DATA = {
@@ -182,8 +161,6 @@ CASES: dict[str, Callable[[], dict[str, Any]]] = {
 LIMITS = dict.fromkeys(("cost", "reduced_chi_square", "bic"), 1e-6)
 LIMITS |= dict.fromkeys(("prediction", "standard_errors", "errors"), 1e-3)
 LIMITS |= {"values": 0.01, "quantiles": 0.1, "elpd_diff": 0.01, "weight": 0.01}
-"""Relative difference of costs and of standard errors; difference of values in standard errors, of quantiles in
-posterior standard deviations, of elpd differences in their standard errors."""
 
 
 def differences(name: str, stored: dict[str, Any], found: dict[str, Any]) -> list[str]:
@@ -225,15 +202,13 @@ def main() -> int:
     for name in names or CASES:
         began = time.perf_counter()
         found = CASES[name]()
-        seconds = time.perf_counter() - began
+        took = f"{time.perf_counter() - began:.0f} s"
         if verb == "write":
             record[name] = found
             RECORD.write_text(json.dumps(record, indent=1, sort_keys=True) + "\n")
-            print(f"{name}: kept, {seconds:.0f} s", flush=True)
-            continue
         said = differences(name, record[name], found)
         wrong += len(said)
-        print("\n".join(said) or f"{name}: as it was, {seconds:.0f} s", flush=True)
+        print("\n".join(said) or f"{name}: {'kept' if verb == 'write' else 'as it was'}, {took}", flush=True)
     return 1 if wrong else 0
 
 

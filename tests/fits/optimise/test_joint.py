@@ -74,6 +74,12 @@ def test_a_part_is_a_fit_of_its_own(joint):
     assert first.minima[0].values == first.values
     with pytest.raises(ValueError, match="part 'third' is not one of first, second"):
         joint.part("third")
+    # it predicts with what all of them say
+    at = fits.slices(incidence=(10,))
+    columns = np.stack([at.wo[:, 2], np.ones(len(at)), np.zeros(len(at))], axis=-1)
+    _, covariance = least_squares(prior=False)
+    sd = np.sqrt(np.sum(columns @ covariance * columns, axis=-1))
+    np.testing.assert_allclose(fits.predict(first, at, draws=4000).sd[:, 0], sd, rtol=0.06)  # of 4000 draws by weight
 
 
 def test_what_takes_the_other_of_whole_and_part(joint):
@@ -94,15 +100,6 @@ def test_what_takes_the_other_of_whole_and_part(joint):
     ):
         with pytest.raises(ValueError, match=r"of a joint fit it takes a part: fit.part\(...\) of first, second"):
             ask()
-
-
-def test_a_part_predicts_with_what_all_of_them_say(joint):
-    at = fits.slices(incidence=(10,))
-    seen = fits.predict(joint.part("first"), at, draws=4000)
-    columns = np.stack([at.wo[:, 2], np.ones(len(at)), np.zeros(len(at))], axis=-1)
-    _, covariance = least_squares(prior=False)
-    sd = np.sqrt(np.sum(columns @ covariance * columns, axis=-1))
-    np.testing.assert_allclose(seen.sd[:, 0], sd, rtol=0.06)  # of 4000 draws by weight
 
 
 def test_the_posterior_is_that_of_all(joint):

@@ -11,7 +11,6 @@ import layerjax as lj
 from benchmarks.measuring.cones import mean_over_cones
 from fits import Free, Instrument, LogUniform, Problem
 from fits.data.geometry import direction
-from fits.problem.model import Model
 from tests.helpers.models import along
 
 SINGLE = lj.SingleScattering()
@@ -47,7 +46,7 @@ def test_a_sample_that_leans_is_seen_at_other_angles(free: bool) -> None:
     lean = 1.5
     of = problem(Instrument(tilt=Free(0.0, -5.0, 5.0) if free else lean))
     signed = np.degrees(np.arctan2(GEOMETRY.wo[:, 0], GEOMETRY.wo[:, 2]))
-    wi, wo = (lj.direction(np.radians(of.data.theta_i + lean), np.pi), lj.direction(np.radians(signed - lean), 0.0))
+    wi, wo = lj.direction(np.radians(of.data.theta_i + lean), np.pi), lj.direction(np.radians(signed - lean), 0.0)
     expected = lj.evaluate(metal(0.3), wi, wo, SINGLE)
     np.testing.assert_allclose(of.predict([0.3, lean] if free else [0.3]), expected, rtol=1e-9)
     assert of.units == {"base.alpha": "1"} | ({"instrument.tilt": "deg"} if free else {})
@@ -65,12 +64,8 @@ def test_leaning_out_of_the_plane_keeps_angles_between() -> None:
 
 def test_derivatives_by_the_offset() -> None:
     of = problem(Instrument(detector_aperture=1.0, tilt=Free(0.0, -5.0, 5.0)))
-
-    def slope(model: Model, vector: jax.Array) -> jax.Array:
-        return jax.jacfwd(model.predict)(vector)[..., 1]
-
     for offset in (0.0, 0.4, -5.0):
-        found = np.asarray(of.call(slope, [0.3, offset]))
+        found = of.call(lambda model, vector: jax.jacfwd(model.predict)(vector)[..., 1], [0.3, offset])
         ends = [np.asarray(of.predict([0.3, offset + step])) for step in (1e-4, -1e-4)]
         np.testing.assert_allclose(found, (ends[0] - ends[1]) / 2e-4, rtol=1e-5, atol=1e-7)
 
@@ -130,15 +125,17 @@ def through(alpha: float, ratio: float) -> tuple[fits.Measurements, Instrument]:
     return along(geometry, values), Instrument(detector_aperture=ratio * width)
 
 
-FREE = metal(Free(0.1, 1e-3, 1.0, LogUniform()), Free(3.0, 1.0, 8.0))
-NOISE = fits.Noise(relative=0.01, floor=1e-4, discrepancy=False)
+def fitted(data: fits.Measurements, instrument: Instrument) -> fits.Fit:
+    free = metal(Free(0.1, 1e-3, 1.0, LogUniform()), Free(3.0, 1.0, 8.0))
+    noise = fits.Noise(relative=0.01, floor=1e-4, discrepancy=False)
+    return fits.fit(free, data, transport=SINGLE, noise=noise, instrument=instrument, starts=4)
 
 
 @pytest.mark.slow
 def test_a_fit_takes_the_rays_that_the_lobe_asks_for_and_counts_what_is_left() -> None:
     """At 1.4 widths of the lobe four rays made k 2.78 +- 0.12 of 3.5."""
     data, seen = through(0.02, 1.4)
-    found = fits.fit(FREE, data, transport=SINGLE, noise=NOISE, instrument=seen, starts=4)
+    found = fitted(data, seen)
     for name, truth in (("base.alpha", 0.02), ("base.k", 3.5)):
         assert abs(found.values[name] - truth) < 3.0 * found.standard_errors[name]
     expected = mean_over_cones(found.stack, data.wi, data.wo, 0.0, seen.detector_aperture)
@@ -149,7 +146,7 @@ def test_a_fit_takes_the_rays_that_the_lobe_asks_for_and_counts_what_is_left() -
     assert found.numerical_error <= 0.1
     assert "rings of rays a cone" in found.status
     # few rays again, as given: the error is told, and is what they lack
-    few = fits.fit(FREE, data, transport=SINGLE, noise=NOISE, instrument=replace(seen, rings=1), starts=4)
+    few = fitted(data, replace(seen, rings=1))
     exact = mean_over_cones(few.stack, data.wi, data.wo, 0.0, seen.detector_aperture)
     lack = np.max(np.abs(few.predicted - exact) / (0.01 * few.predicted + 1e-4))
     assert few.numerical_error == pytest.approx(lack, rel=0.2)
@@ -159,6 +156,6 @@ def test_a_fit_takes_the_rays_that_the_lobe_asks_for_and_counts_what_is_left() -
 @pytest.mark.slow
 def test_a_broad_lobe_keeps_four_rays() -> None:
     data, seen = through(0.1, 0.2)
-    found = fits.fit(FREE, data, transport=SINGLE, noise=NOISE, instrument=seen, starts=2)
+    found = fitted(data, seen)
     assert found.problem.instrument == replace(seen, rings=1)
     assert np.max(np.bincount(np.asarray(found.problem.model.optics.row))) == 4

@@ -64,18 +64,19 @@ NOISES = {
 }
 
 
-@pytest.mark.parametrize("name", NOISES)
-def test_problem_against_a_likelihood_written_out(name: str) -> None:
+@pytest.mark.parametrize("noise", NOISES.values(), ids=NOISES)
+def test_problem_against_a_likelihood_written_out(noise: Noise) -> None:
     """Log-likelihood and log-prior by scipy; the residuals give their sum up to one constant."""
-    noise = NOISES[name]
     problem = Problem(STACK, measured(VALUES, SIGMA), line, noise, Free(1.0, 0.5, 2.0, LogNormal(1.0, 0.1)))
     assert problem.names[:3] == ("['a']", "['b']", "scale")
     offsets = []
     for vector in np.random.default_rng(1).uniform(problem.low, problem.high, (4, len(problem.names))):
         named = dict(zip(problem.names, vector, strict=True))
-        predicted = named["scale"] * (design(COUNT) @ [named["['a']"], named["['b']"]])[:, None]
-        relative = named.get("noise.relative", noise.relative if isinstance(noise.relative, float) else 0.0)
-        floor = named.get("noise.floor", noise.floor if isinstance(noise.floor, float) else 0.0)
+        predicted = named["scale"] * (design(COUNT) @ vector[:2])[:, None]
+        relative, floor = (
+            named.get(f"noise.{name}", one if isinstance(one, float) else 0.0)
+            for name, one in (("relative", noise.relative), ("floor", noise.floor))
+        )
         sigma = np.sqrt((SIGMA**2 if noise.use_sigma else 0.0) + (relative * predicted) ** 2 + floor**2)
         law = stats.norm if noise.tails == "gaussian" else stats.t(3.0)
         each = law.logpdf((VALUES - predicted) / sigma) - np.log(sigma)
@@ -108,9 +109,8 @@ def test_masked_samples_never_enter_and_noise_is_five_per_cent_by_default() -> N
     assert clean.count == COUNT - COUNT // 4
     np.testing.assert_array_equal(clean.residuals(vector), masked.residuals(vector))
     predicted = (design(COUNT) @ vector)[:, None]
-    sigma = np.hypot(0.05 * predicted, 1e-4 * np.median(np.abs(VALUES)))
-    problem = Problem(STACK, measured(VALUES), line)
-    assert float(problem.log_likelihood(vector)) == pytest.approx(stats.norm.logpdf(VALUES, predicted, sigma).sum())
+    expected = stats.norm.logpdf(VALUES, predicted, np.hypot(0.05 * predicted, 1e-4 * np.median(np.abs(VALUES))))
+    assert float(Problem(STACK, measured(VALUES), line).log_likelihood(vector)) == pytest.approx(expected.sum())
 
 
 def test_named_residuals() -> None:
@@ -155,7 +155,7 @@ CALLABLES = {
 def test_any_callable_stands_for_a_transport(transport, gain: float) -> None:
     problem = Problem(PAINT, DATA, transport=transport)
     np.testing.assert_allclose(problem.predict([0.3]), np.full((3, 1), gain * 0.3 / np.pi), rtol=1e-12)
-    seen = simulate(lj.Stack([], lj.Lambertian(0.3)), slices(incidence=[20], outgoing=[10]), transport=transport)
+    seen = simulate(lj.Stack([], lj.Lambertian(0.3)), slices([20], [10]), transport=transport)
     np.testing.assert_allclose(seen.values, [[gain * 0.3 / np.pi]], rtol=1e-12)
 
 
@@ -218,7 +218,6 @@ def rough(roughness: Free | np.ndarray) -> lj.Stack:
         (lambda: Noise(floor=Free(0.1, 0.0, 1.0)), r"Noise.floor.low is 0.0; it must be a number in \[1e-100, "),
         (lambda: Noise(relative=Free([0.1, 0.1], 0.0, 1.0)), "Noise.relative has 2 channels"),
         (lambda: Noise(floor=1e-200), r"Noise.floor is 1e-200; it must be a number in \[1e-100, 1e\+100\]"),
-        (lambda: Noise(relative=Free(0.5, 0.0, 5.0)), r"Noise.relative.high is 5.0; it must be a number in \[0, 1\]"),
         (lambda: Noise(tails="cauchy"), "Noise.tails: 'cauchy' is not one of 'gaussian', 'student'"),
         (lambda: Noise(tails="student", discrepancy=True), "Noise.tails is 'student'; with model discrepancy it must"),
         (lambda: Noise(discrepancy=0.3), "Noise.discrepancy is 0.3; it must be true, false or Discrepancy"),
@@ -226,7 +225,6 @@ def rough(roughness: Free | np.ndarray) -> lj.Stack:
         (lambda: Instrument(source_aperture=Free(1.0, 0.0, 2.0)), r"source_aperture is Free.* in \[0, 30\]"),
         (lambda: Instrument(tilt=Free(0.0, -20.0, 5.0)), r"tilt.low is -20.0; it must be a number in \[-10, 10\]"),
         (lambda: Instrument(gain_sd=True), "Instrument.gain_sd is True"),
-        (lambda: Instrument(floor=1e-200), r"Instrument.floor is 1e-200; it must be a number in \[1e-100, 1e\+100\]"),
         (lambda: options_from({"tolerance": 1.0}), r"\[options\] has an unknown key 'tolerance'; allowed: same_v"),
         (
             lambda: Problem(STACK, LINE_DATA, line, Noise(floor=1e-4), instrument=Instrument(floor=1e-3)),

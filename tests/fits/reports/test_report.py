@@ -121,8 +121,6 @@ def test_axes_are_logarithmic_where_the_range_is_wide() -> None:
         assert isinstance(pictures.value_norm(np.array(values)), LogNorm) == wide
 
 
-# ---- totals ----
-
 SPHERES = Spheres(Sphere(100.0, 20.0, 5.0, 8.0, 0.95), Sphere(90.0, 20.0, wall=0.97), 0.98, True)
 
 

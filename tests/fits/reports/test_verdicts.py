@@ -19,7 +19,6 @@ from tests.helpers.models import POSITIVE_LINE, SCANS, along, line, wrong_line
 
 TRUTH = np.array([1.0, 0.5, 0.1, 12.0, 12.0, 0.3])  # the line, and the discrepancy: amplitude, lengths, exponent
 NOISE = Noise(relative=0.02, floor=1e-4, discrepancy=True)
-WIDE = Noise(relative=0.2, floor=1e-4, discrepancy=False)
 FIRST, SECOND, WEAKLY = "layers[0].thickness", "base.albedo", "weakly identified: see direction"
 TOGETHER = Direction(0.3, {FIRST: 0.8, SECOND: -0.6}, {FIRST: 0.01, SECOND: 0.02})
 TERM = SimpleNamespace(amplitude=0.05, grazing_exponent=0.5, length_half=18.0, length_difference=11.0)
@@ -40,9 +39,8 @@ def test_no_two_statements_contradict_each_other(coat_fit: Fit) -> None:
     parameters = ["identified", f"correlated with {SECOND} +0.97", f"{WEAKLY} 1", "at a bound", "insensitive: no"]
     parameters += ["limited by", "prior-dominated:"]
     sizes = {-9.0: 0.2, 0.0: 1.0, 9.0: 4.0}  # excess of chi-square, and chi-square
-    table = product((True, False), (True, False), (True, False), (True, False), sizes, (0.0, 0.9), (None, (TERM, 9.0)),
-                    (0, 1, 3), parameters)  # fmt: skip
-    count = 0
+    count, switches = 0, [(True, False)] * 4
+    table = product(*switches, sizes, (0.0, 0.9), (None, (TERM, 9.0)), (0, 1, 3), parameters)
     for converged, likelihood, stated, described, excess, lag, term, others, identified in table:
         if not described and (not likelihood or (term is None and excess <= 0.0)):
             continue  # what is not described has a large chi-square, at least without the discrepancy
@@ -107,8 +105,9 @@ def test_residuals_of_the_assumed_model_are_independent_standard_normal(fitted: 
         residuals.append(standardised(true))
         pairs.append(neighbours(true.problem.data, residuals[-1]))
         assert true.chi_square == pytest.approx(np.sum(residuals[-1] ** 2), rel=1e-6)
-    everything, (first, second) = np.concatenate(residuals), (np.concatenate(part) for part in zip(*pairs, strict=True))
-    assert np.sqrt(np.mean(everything**2)) == pytest.approx(1.0, abs=3.0 / np.sqrt(2.0 * everything.size))
+    first, second = (np.concatenate(part) for part in zip(*pairs, strict=True))
+    size = np.sqrt(np.mean(np.square(residuals)))
+    assert size == pytest.approx(1.0, abs=3.0 / np.sqrt(2.0 * np.size(residuals)))
     assert abs(correlation(first, second)) < 3.0 / np.sqrt(len(first))
     # beside the curve with the discrepancy, which follows the data, residuals are smaller
     assert np.mean(misfit(fitted) ** 2) < np.mean(standardised(fitted) ** 2)
@@ -129,9 +128,9 @@ def test_a_stack_that_misses_is_named_though_the_discrepancy_absorbs_all(fitted:
     assert within == pytest.approx(off.reduced_chi_square, rel=0.01)
     assert without == pytest.approx(alone, rel=0.05)
     assert not assess(replace(fitted, problem=simulated(0), vector=TRUTH)).described  # 10 % beside a noise of 2 %
-    right = replace(fitted, problem=replace(fitted.problem, noise=WIDE), unidentified=())
-    right = replace(right, vector=TRUTH[:2], errors=fitted.errors[:2], covariance=fitted.covariance[:2, :2])
-    assert assess(right).described
+    true = {"vector": TRUTH[:2], "errors": fitted.errors[:2], "covariance": fitted.covariance[:2, :2]}
+    wide = replace(fitted.problem, noise=Noise(relative=0.2, floor=1e-4, discrepancy=False))
+    assert assess(replace(fitted, problem=wide, unidentified=(), **true)).described
 
 
 def test_both_curves_are_drawn_and_the_residuals_are_those_of_the_one_with_the_discrepancy(fitted: Fit) -> None:

@@ -1,6 +1,5 @@
 """The samplers against posteriors known in closed form, and against being interrupted."""
 
-import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,7 +12,7 @@ from scipy import stats
 from fits import Fit, Free, SamplerOptions, fit, sample
 from fits.sampling import chain
 from fits.sampling.sample import Sampler, load, walkers_of
-from tests.helpers.models import COUNT, design, line, line_data, line_fit, student_fit
+from tests.helpers.models import COUNT, design, line, line_data, line_fit
 
 
 @pytest.fixture(scope="module")
@@ -25,26 +24,23 @@ def test_the_posterior_of_a_line_is_its_regression(result: Fit, posterior) -> No
     """Mean and covariance in closed form; tolerance 5 Monte Carlo errors of the effective samples."""
     covariance = np.linalg.inv(design(COUNT).T @ design(COUNT)) * 0.05**2
     mean = covariance @ design(COUNT).T @ result.problem.data.values[:, 0] / 0.05**2
-    spread = np.sqrt(np.diagonal(covariance))
+    spreads, errors = np.sqrt(np.diagonal(covariance)), 5 / np.sqrt(posterior.effective_samples)
     assert posterior.converged
-    count = posterior.effective_samples
-    summary = posterior.summary()
-    for index, name in enumerate(posterior.names):
-        median, low, high, average, deviation = summary[name]
-        error = 5 / np.sqrt(count[index])
-        assert average == pytest.approx(mean[index], abs=error * spread[index])
-        assert median == pytest.approx(mean[index], abs=1.3 * error * spread[index])
-        assert deviation == pytest.approx(spread[index], rel=error)
-        assert [low, high] == pytest.approx([mean[index] - spread[index], mean[index] + spread[index]], rel=error)
+    summary = posterior.summary().values()
+    for (median, low, high, average, deviation), at, spread, error in zip(summary, mean, spreads, errors, strict=True):
+        assert average == pytest.approx(at, abs=error * spread)
+        assert median == pytest.approx(at, abs=1.3 * error * spread)
+        assert deviation == pytest.approx(spread, rel=error)
+        assert [low, high] == pytest.approx([at - spread, at + spread], rel=error)
     kept = posterior.chain[posterior.burn_in :].reshape(-1, 2)
-    assert np.corrcoef(kept.T)[0, 1] == pytest.approx(covariance[0, 1] / spread.prod(), abs=5 / np.sqrt(count.min()))
+    assert np.corrcoef(kept.T)[0, 1] == pytest.approx(covariance[0, 1] / spreads.prod(), abs=errors.max())
 
 
 def test_it_stops_when_the_chain_is_long_enough(posterior) -> None:
     kept = len(posterior.chain) - posterior.burn_in
-    assert np.all(kept >= 50 * posterior.autocorrelation_time)
-    assert np.all(posterior.effective_samples >= 1000.0)
-    assert np.all(posterior.r_hat <= 1.01)
+    assert kept >= 50 * posterior.autocorrelation_time.max()
+    assert posterior.effective_samples.min() >= 1000.0
+    assert posterior.r_hat.max() <= 1.01
     assert len(posterior.chain) < 500
     assert 0.2 < posterior.acceptance < 1.0
     again = emcee.autocorr.integrated_time(posterior.chain[posterior.burn_in :], tol=0)
@@ -137,19 +133,12 @@ def test_a_chain_of_something_else_is_refused(result: Fit, tmp_path: Path) -> No
     path = tmp_path / "chain"
     sample(result, walkers=16, seed=1, max_steps=100, path=path)
     other = line_fit(seed=5)
-    for one, walkers, seed, words in (
-        (other, 16, 1, "another problem (posterior)"),
-        (result, 16, 2, "(seed 1, not 2)"),
-        (result, 18, 1, "(walkers 16, not 18)"),
-    ):
-        with pytest.raises(ValueError, match=re.escape(words)):
-            sample(one, walkers=walkers, seed=seed, path=path)
+    words = r"another problem \(posterior, seed 1, not 2, walkers 16, not 18\)"
+    with pytest.raises(ValueError, match=words):
+        sample(other, walkers=18, seed=2, path=path)
     with jax.enable_x64(False), pytest.raises(ValueError, match="precision float64, not float32"):
         load(result, path)
     assert len(sample(other, walkers=16, seed=2, path=path, resume=False, max_steps=100).chain) == 100
-    path.write_bytes(b"not SQLite")
-    with pytest.raises(ValueError, match="no store of this version"):
-        sample(result, walkers=16, seed=1, path=path)
 
 
 def test_inference_data(result: Fit, posterior) -> None:
@@ -162,13 +151,6 @@ def test_inference_data(result: Fit, posterior) -> None:
     assert noise.std() == pytest.approx(1.0, abs=5 / np.sqrt(2 * noise.size))
     np.testing.assert_array_equal(data.observed_data["value"], result.problem.data.values)
     assert data.log_likelihood["value"].dims == ("chain", "draw", "sample", "channel")
-
-
-def test_free_student_noise_is_sampled() -> None:
-    summary = sample(fitted := student_fit(), walkers=16, seed=4).summary()
-    for name, (median, *_, deviation) in summary.items():
-        assert abs(median - fitted.values[name]) < fitted.standard_errors[name]
-        assert deviation == pytest.approx(fitted.standard_errors[name], rel=0.3)  # asymptotic, for 100 data
 
 
 def test_refused(result: Fit) -> None:
