@@ -147,14 +147,8 @@ STACKS = sorted(path.stem for path in EXAMPLES.glob("*.toml"))
 PAIRS = [("nite", stack) for stack in STACKS] + [(name, "coated_diffuse") for name in DATA if name != "nite"]
 CASES: dict[str, Callable[[], dict[str, Any]]] = {
     **{f"{name}-{stack}": partial(fitted, stack, COATINGS / DATA[name]) for name, stack in PAIRS},
-    "held_out": held_out,
-    "joint": joint,
-    "slab": slab,
-    "mixture": mixture,
-    "map": texels,
-    "search": structures,
-    "compare": compared,
-    "posterior": posterior,
+    **{case.__name__: case for case in (held_out, joint, slab, mixture, posterior)},
+    **{"map": texels, "search": structures, "compare": compared},
 }
 
 

@@ -33,8 +33,7 @@ def wrong():
     return fitted()
 
 
-@pytest.mark.slow
-def test_a_wrong_shape_is_fitted_with_them(wrong):
+def test_a_wrong_shape_is_fitted_with_them_and_both_are_told(wrong):
     plain, before = fitted(noise=replace(NOISE, discrepancy=False)), wrong.without_discrepancy
     assert wrong.problem.noise.discrepancy == Discrepancy()
     assert plain.without_discrepancy is None
@@ -45,6 +44,14 @@ def test_a_wrong_shape_is_fitted_with_them(wrong):
     assert 0.03 < wrong.values["noise.discrepancy.amplitude"] < 0.3
     for name in plain.values:
         assert wrong.standard_errors[name] > 2.0 * plain.standard_errors[name]
+    words = " ".join(verdicts.verdict(wrong).remarks)
+    assert "neighbouring residuals correlate by +0." in words
+    assert "Set `discrepancy = false` to disable it" in words
+    assert f"Model discrepancy: {100.0 * wrong.values['noise.discrepancy.amplitude']:.2g} % of the BSDF" in words
+    # two starts with independent noise, then one from each of their minima and two more with the discrepancy
+    starts = sum(wrong.start_outcomes.values())
+    assert starts > 2
+    assert f"{wrong.minima[0].count} of {starts} starts converged to the best" in wrong.status
 
 
 @pytest.mark.slow
@@ -72,17 +79,6 @@ def test_a_right_one_is_not():
 )
 def test_where_they_cannot_be_counted_they_are_not(how):
     assert fitted(**how, starts=1).without_discrepancy is None
-
-
-def test_both_are_told(wrong):
-    words = " ".join(verdicts.verdict(wrong).remarks)
-    assert "neighbouring residuals correlate by +0." in words
-    assert "Set `discrepancy = false` to disable it" in words
-    assert f"Model discrepancy: {100.0 * wrong.values['noise.discrepancy.amplitude']:.2g} % of the BSDF" in words
-    # two starts with independent noise, then one from each of their minima and two more with the discrepancy
-    starts = sum(wrong.start_outcomes.values())
-    assert starts > 2
-    assert f"{wrong.minima[0].count} of {starts} starts converged to the best" in wrong.status
 
 
 def test_a_killed_fit_goes_on_in_either_part(tmp_path, wrong, monkeypatch):

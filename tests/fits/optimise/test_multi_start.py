@@ -11,7 +11,7 @@ from fits.optimise import multi_start as starts_module
 from fits.optimise.levenberg_marquardt import evaluate_at
 from fits.optimise.multi_start import LEAST_GAIN, multi_start, start_points, starts_store, unit_of
 from fits.optimise.result import OUTCOMES
-from tests.helpers.models import LINE, LOBE, LOBE_STACK, directions, line, line_data, lobe, measured, noisy_lobe
+from tests.helpers.models import LINE, LOBE_STACK, line, line_data, lobe, noisy_lobe
 from tests.helpers.places import COATINGS, EXAMPLES
 from tests.helpers.stores import keys
 
@@ -57,9 +57,8 @@ def test_the_lowest_end_is_the_fit_though_it_ran_out_of_steps(monkeypatch):
     monkeypatch.setattr(starts_module, "MOST_ROUNDS", 1)
     calls = []
     # a stack of its own, so that the program is compiled with this number of steps
-    exact = lobe(LOBE, directions(200, 1), directions(200, 2))
-    data = measured(exact, 0.01 * exact)
-    result = fit(LOBE_STACK, data, transport=lambda *a: lobe(*a), starts=6, progress=lambda *a: calls.append(a))
+    how = {"transport": lambda *a: lobe(*a), "progress": lambda *a: calls.append(a)}
+    result = fit(LOBE_STACK, noisy_lobe(0, 200), starts=6, **how)
     seen = min(float(call[3].split()[-1]) for call in calls)
     assert result.minima[0].cost <= seen * (1 + 1e-5)
     assert sum(result.start_outcomes.values()) == 6
@@ -89,17 +88,9 @@ def test_starts_are_those_of_the_same_fit_only(tmp_path):
     fit(LINE, line_data(), transport=line, starts=4, checkpoint=path)
     written = path.read_bytes()
     assert kept() == 4
-    others = [
-        {"count": 5},
-        {"seed": 1},
-        {"data": line_data(seed=1)},
-        {"noise": Noise(tails="student")},
-        {"objective": "cosine_l2"},
-        {"scale": 1.01},
-        {"stack": {**LINE, "b": LINE["b"].start}},
-        {"transport": lambda stack, wi, wo: 2.0 * line(stack, wi, wo)},
-    ]
-    assert [kept(**other) for other in others] == [0] * len(others)
+    changes = {"data": line_data(seed=1), "noise": Noise(tails="student"), "objective": "cosine_l2", "scale": 1.01}
+    changes |= {"stack": LINE | {"b": 0.1}, "transport": lambda *given: 2.0 * line(*given), "count": 5, "seed": 1}
+    assert {name: kept(**{name: other}) for name, other in changes.items()} == dict.fromkeys(changes, 0)
 
 
 @pytest.mark.slow

@@ -14,13 +14,8 @@ transport = "SingleScattering"
 
 [mixture.dust]
 weight = { start = 0.5, low = 0.0, high = 1.0 }
-[[mixture.dust.layers]]
-kind = "Medium"
-thickness = { start = 1.0, low = 0.1, high = 5.0 }
-albedo = 0.6
-[mixture.dust.base]
-kind = "Lambertian"
-albedo = 0.1
+layers = [{ kind = "Medium", thickness = { start = 1.0, low = 0.1, high = 5.0 }, albedo = 0.6 }]
+base = { kind = "Lambertian", albedo = 0.1 }
 
 [mixture.metal.base]
 kind = "Conductor"
@@ -60,7 +55,11 @@ WEIGHT = "weight = { start = 0.5, low = 0.0, high = 1.0 }"
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("high = 1.0 }\n[[", "high = 1.2 }\n[[", r"mixture.dust.weight.high is 1.2, must be a number in \[0, 1\]"),
+        (
+            "high = 1.0 }\nlayers",
+            "high = 1.2 }\nlayers",
+            r"mixture.dust.weight.high is 1.2, must be a number in \[0, 1\]",
+        ),
         ("weight = {", "weight = 0.3\nwait = {", r"mixture.dust has an unknown key 'wait' \(did you mean 'weight'\?\)"),
         ("albedo = 0.1", "albedo = 1.1", r"mixture.dust.base: Lambertian.albedo: 1.1 is outside \[0, 1\]"),
         ("[mixture.metal.base]", "[mixture.metal]\nweight = 0.2\n[mixture.metal.base]", "one has to be free of choice"),

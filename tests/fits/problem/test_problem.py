@@ -73,10 +73,7 @@ def test_problem_against_a_likelihood_written_out(noise: Noise) -> None:
     for vector in np.random.default_rng(1).uniform(problem.low, problem.high, (4, len(problem.names))):
         named = dict(zip(problem.names, vector, strict=True))
         predicted = named["scale"] * (design(COUNT) @ vector[:2])[:, None]
-        relative, floor = (
-            named.get(f"noise.{name}", one if isinstance(one, float) else 0.0)
-            for name, one in (("relative", noise.relative), ("floor", noise.floor))
-        )
+        relative, floor = (named.get(f"noise.{name}", getattr(noise, name) or 0.0) for name in ("relative", "floor"))
         sigma = np.sqrt((SIGMA**2 if noise.use_sigma else 0.0) + (relative * predicted) ** 2 + floor**2)
         law = stats.norm if noise.tails == "gaussian" else stats.t(3.0)
         each = law.logpdf((VALUES - predicted) / sigma) - np.log(sigma)

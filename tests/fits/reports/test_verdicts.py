@@ -46,17 +46,9 @@ def test_no_two_statements_contradict_each_other(coat_fit: Fit) -> None:
             continue  # what is not described has a large chi-square, at least without the discrepancy
         fitted = SimpleNamespace(converged=converged, is_posterior=likelihood, alternatives=range(others))
         vars(fitted).update(degrees_of_freedom=400, unidentified=(TOGETHER,) * (WEAKLY in identified))
-        case = replace(
-            facts,
-            fit=fitted,
-            noise_assumed=not stated,
-            described=described,
-            excess=excess,
-            ratio=sizes[excess],
-            lag_one=lag,
-            discrepancy=term,
-            words={FIRST: identified, SECOND: "identified"},
-        )
+        size = {"excess": excess, "ratio": sizes[excess], "lag_one": lag}
+        case = replace(facts, fit=fitted, noise_assumed=not stated, described=described, discrepancy=term, **size)
+        case = replace(case, words={FIRST: identified, SECOND: "identified"})
         said = [one for some in verdicts.statements(case).values() for one in some]
         claims: dict[str, str] = {}
         for sentence, own in said:

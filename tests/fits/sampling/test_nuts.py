@@ -58,7 +58,7 @@ def test_it_goes_on_from_its_file_to_the_same_end(result: Fit, short: Posterior,
 
 
 def test_chains_and_extra_are_there(result: Fit, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert walkers_of(20, "nuts", None) == 4
+    assert (walkers_of(20, "nuts", None), walkers_of(20, "emcee", None)) == (4, 42)
     with pytest.raises(ValueError, match="walkers is 1; it must be at least 2"):
         sample(result, sampler="nuts", walkers=1)
     monkeypatch.setitem(sys.modules, "blackjax", None)

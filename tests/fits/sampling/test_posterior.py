@@ -11,7 +11,7 @@ from scipy import stats
 
 from fits import Fit, Free, SamplerOptions, fit, sample
 from fits.sampling import chain
-from fits.sampling.sample import Sampler, load, walkers_of
+from fits.sampling.sample import Sampler, load
 from tests.helpers.models import COUNT, design, line, line_data, line_fit
 
 
@@ -67,15 +67,6 @@ def test_it_goes_on_for_the_effective_samples_that_are_asked_for(result: Fit, po
     assert 0.5 < (shown[150][2] - steps[150]) / (len(more.chain) - steps[150]) < 2.0
 
 
-def test_options_are_kept_with_the_chain(result: Fit, tmp_path: Path) -> None:
-    options = SamplerOptions(ess=100.0, autocorrelation_times=10.0, r_hat=1.1, walkers=8, burn_in=0.25)
-    posterior = sample(result, options=options, path=tmp_path / "chain")
-    assert posterior.options == options
-    assert posterior.burn_in == len(posterior.chain) // 4
-    assert load(result, tmp_path / "chain").options == options
-    assert walkers_of(20, "emcee", None) == 42  # more than twice as many as parameters
-
-
 @pytest.mark.parametrize("sampler", ["emcee", pytest.param("nuts", marks=pytest.mark.slow)])
 def test_a_parameter_on_its_bound_has_a_truncated_posterior(sampler: Sampler) -> None:
     """b is free within [0.55, 3] and best below: given a, a Gaussian cut off at its bound."""
@@ -97,10 +88,12 @@ def test_a_parameter_on_its_bound_has_a_truncated_posterior(sampler: Sampler) ->
     assert [median, lower, upper] == pytest.approx(law.ppf([0.5, 0.158655, 0.841345]), abs=2 * error * law.std())
 
 
-def test_a_short_chain_reports_nothing_unless_told_to(result: Fit, tmp_path: Path) -> None:
-    options = SamplerOptions(walkers=16, max_steps=100, autocorrelation_times=500.0)
+def test_a_short_chain_reports_nothing_unless_told_to_and_keeps_its_options(result: Fit, tmp_path: Path) -> None:
+    options = SamplerOptions(ess=100.0, r_hat=1.1, walkers=16, max_steps=100, autocorrelation_times=500.0, burn_in=0.25)
     short = sample(result, seed=1, options=options, path=tmp_path / "chain")
     assert not short.converged
+    assert load(result, tmp_path / "chain").options == short.options == options
+    assert short.burn_in == 25
     words = "chain of 100 steps is too short.*autocorrelation time.*larger max_steps"
     for ask in (short.summary, lambda: short.inference_data):
         with pytest.raises(ValueError, match=words):
@@ -133,7 +126,7 @@ def test_a_chain_of_something_else_is_refused(result: Fit, tmp_path: Path) -> No
     path = tmp_path / "chain"
     sample(result, walkers=16, seed=1, max_steps=100, path=path)
     other = line_fit(seed=5)
-    words = r"another problem \(posterior, seed 1, not 2, walkers 16, not 18\)"
+    words = r"another problem \(walkers 16, not 18, seed 1, not 2, posterior\)"
     with pytest.raises(ValueError, match=words):
         sample(other, walkers=18, seed=2, path=path)
     with jax.enable_x64(False), pytest.raises(ValueError, match="precision float64, not float32"):
@@ -156,7 +149,7 @@ def test_inference_data(result: Fit, posterior) -> None:
 def test_refused(result: Fit) -> None:
     named = replace(result, problem=replace(result.problem, objective="cosine_l2"))
     for fitted, options, message in (
-        (result, {"walkers": 4}, "walkers is 4; it must be even and at least 6"),
+        (result, {"walkers": 4}, "walkers is 4; it must be even and at least 6"),  # more than twice the parameters
         (result, {"max_steps": 10}, "max_steps: 10 is not a whole number of at least 100"),
         (named, {}, "sample: a fit of 'cosine_l2' has no noise model, and so no posterior"),
     ):
