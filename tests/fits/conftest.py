@@ -4,6 +4,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 import layerjax as lj
@@ -11,7 +12,6 @@ from fits import Fit, Measurements, fit, read_problem, simulate, slices, write_c
 from fits.cli.parser import main
 from tests.helpers.models import line_fit
 
-TRUE_ALBEDO, TRUE_THICKNESS = 0.4, 0.6
 PROBLEM = """\
 # a hazy coat over paint
 transport = "SingleScattering"
@@ -37,12 +37,11 @@ def coat_toml(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def coat_data() -> Measurements:
-    """Noisy slices of that stack with known parameters; the last ten readings are masked."""
-    truth = lj.Stack([lj.Medium(thickness=TRUE_THICKNESS, albedo=0.8)], base=lj.Lambertian(albedo=TRUE_ALBEDO))
+    """Noisy slices of that stack with known parameters; the last ten measurements are masked."""
+    truth = lj.Stack([lj.Medium(thickness=0.6, albedo=0.8)], base=lj.Lambertian(albedo=0.4))
     view = slices(incidence=(10, 50), azimuth=(0, 60))
     data = simulate(truth, view, transport=lj.SingleScattering(), noise=0.03, seed=1)
-    keep = [True] * (len(data) - 10) + [False] * 10
-    return data.where(keep, "the last ten readings are left out")
+    return data.where(np.arange(len(data)) < len(data) - 10, "the last ten readings are left out")
 
 
 @pytest.fixture

@@ -5,9 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fits import Discrepancy, Free, Noise, Posterior, fit, load_fit, save_fit, slices
+from fits import Discrepancy, Free, Noise, Posterior, fit, slices
 from fits.optimise import multi_start as starts_module
-from fits.optimise.result import WithoutDiscrepancy
 from fits.problem.discrepancy import log_scales, places
 from fits.reports import verdicts
 from tests.helpers.models import along, line
@@ -34,19 +33,25 @@ def wrong():
     return fitted()
 
 
-@pytest.mark.slow
-def test_a_wrong_shape_is_fitted_with_them(wrong):
-    plain = fitted(noise=replace(NOISE, discrepancy=False))
+def test_a_wrong_shape_is_fitted_with_them_and_both_are_told(wrong):
+    plain, before = fitted(noise=replace(NOISE, discrepancy=False)), wrong.without_discrepancy
     assert wrong.problem.noise.discrepancy == Discrepancy()
-    assert wrong.without_discrepancy is not None
     assert plain.without_discrepancy is None
-    assert wrong.without_discrepancy.values == pytest.approx(plain.values, rel=1e-6)
-    assert wrong.without_discrepancy.chi_square == pytest.approx(plain.chi_square)
-    assert wrong.without_discrepancy.residual_autocorrelation > 0.8
+    assert before.values == pytest.approx(plain.values, rel=1e-6)
+    assert before.chi_square == pytest.approx(plain.chi_square)
+    assert before.residual_autocorrelation > 0.8
     assert wrong.log_likelihood > plain.log_likelihood + 20.0
     assert 0.03 < wrong.values["noise.discrepancy.amplitude"] < 0.3
     for name in plain.values:
         assert wrong.standard_errors[name] > 2.0 * plain.standard_errors[name]
+    words = " ".join(verdicts.verdict(wrong).remarks)
+    assert "neighbouring residuals correlate by +0." in words
+    assert "Set `discrepancy = false` to disable it" in words
+    assert f"Model discrepancy: {100.0 * wrong.values['noise.discrepancy.amplitude']:.2g} % of the BSDF" in words
+    # two starts with independent noise, then one from each of their minima and two more with the discrepancy
+    starts = sum(wrong.start_outcomes.values())
+    assert starts > 2
+    assert f"{wrong.minima[0].count} of {starts} starts converged to the best" in wrong.status
 
 
 @pytest.mark.slow
@@ -67,8 +72,6 @@ def test_a_right_one_is_not():
     assert not found.problem.noise.discrepancy
     assert list(found.values) == ["['a']", "['b']"]
     assert not verdicts.verdict(found).remarks
-    (remark,) = verdicts.verdict(fitted(0.0, Noise(discrepancy=False))).remarks
-    assert "5 % of the model's value is assumed" in remark
 
 
 @pytest.mark.parametrize(
@@ -76,17 +79,6 @@ def test_a_right_one_is_not():
 )
 def test_where_they_cannot_be_counted_they_are_not(how):
     assert fitted(**how, starts=1).without_discrepancy is None
-
-
-def test_both_are_told(wrong):
-    words = " ".join(verdicts.verdict(wrong).remarks)
-    assert "neighbouring residuals correlate by +0." in words
-    assert "Set `discrepancy = false` to disable it" in words
-    assert f"Model discrepancy: {100.0 * wrong.values['noise.discrepancy.amplitude']:.2g} % of the BSDF" in words
-    # two starts with independent noise, then one from each of their minima and two more with the discrepancy
-    starts = sum(wrong.start_outcomes.values())
-    assert starts > 2
-    assert f"{wrong.minima[0].count} of {starts} starts converged to the best" in wrong.status
 
 
 def test_a_killed_fit_goes_on_in_either_part(tmp_path, wrong, monkeypatch):
@@ -104,16 +96,3 @@ def test_a_killed_fit_goes_on_in_either_part(tmp_path, wrong, monkeypatch):
     np.testing.assert_array_equal(fitted(checkpoint=kept).vector, wrong.vector)
     assert len(run) == 1  # of two starts and, with model discrepancy, three
     assert {path.name for path in tmp_path.iterdir()} >= {"starts", "starts-discrepancy"}
-
-
-def test_a_result_directory_keeps_it(tmp_path, coat_fit):
-    problem = replace(coat_fit.problem, noise=Noise(relative=0.03, discrepancy=True))
-    count, nothing = len(problem.names), {"minima": (), "unidentified": ()}
-    numbers = {"vector": np.array(problem.start), "errors": np.ones(count), "covariance": np.eye(count)}
-    before = WithoutDiscrepancy(coat_fit.values, coat_fit.standard_errors, 30.0, 20, 12.5, 0.4, 19)
-    found = replace(coat_fit, problem=problem, **numbers, **nothing, without_discrepancy=before)
-    save_fit(found, tmp_path / "result")
-    again = load_fit(tmp_path / "result")
-    assert again.without_discrepancy == before
-    assert again.problem.noise == problem.noise
-    assert again.values == found.values

@@ -8,10 +8,9 @@ import pytest
 from scipy.optimize import least_squares
 
 import layerjax as lj
-from fits import Direction, FitOptions, Free, LogNormal, LogUniform, Noise, Normal, Problem, fit, simulate, slices
+from fits import Direction, Free, Noise, Normal, Problem, Uniform, evidence, fit, predict, simulate, slices
 from fits.optimise.fit import start_points
 from fits.optimise.levenberg_marquardt import COST_TOLERANCE, BoxLevenbergMarquardt
-from fits.optimise.options import options_from
 from fits.problem.compilation import _program
 from fits.reports import verdicts
 from tests.helpers.models import COUNT, LINE, LOBE, LOBE_STACK, design, line, line_data, lobe, measured, noisy_lobe
@@ -24,13 +23,10 @@ def regression(data, columns=DESIGN):
     return np.linalg.lstsq(columns, data.values[:, 0], rcond=None)[0]
 
 
-@pytest.fixture(scope="module")
-def lobe_fit():
-    return fit(LOBE_STACK, noisy_lobe(0), transport=lobe, starts=16)
-
-
-def test_the_lobe_fit_is_scipys(lobe_fit):
-    data, names = noisy_lobe(0), [name.strip("[']") for name in lobe_fit.problem.names]
+def test_the_lobe_fit_is_scipys():
+    data = noisy_lobe(0)
+    lobe_fit = fit(LOBE_STACK, data, transport=lobe, starts=16)
+    names = [name.strip("[']") for name in lobe_fit.problem.names]
 
     def residuals(vector):
         predicted = lobe(dict(zip(names, vector, strict=True)), data.wi, data.wo)
@@ -40,7 +36,7 @@ def test_the_lobe_fit_is_scipys(lobe_fit):
     covariance = np.linalg.inv(reference.jac.T @ reference.jac)
     errors = np.sqrt(np.diagonal(covariance))
     assert lobe_fit.converged
-    assert np.all(np.abs(lobe_fit.vector - reference.x) < 1e-3 * errors)
+    np.testing.assert_allclose((lobe_fit.vector - reference.x) / errors, 0.0, atol=1e-3)
     assert lobe_fit.chi_square == pytest.approx(2 * reference.cost, rel=1e-8)
     np.testing.assert_allclose(lobe_fit.errors, errors, rtol=1e-3)
     np.testing.assert_allclose(lobe_fit.correlation, covariance / np.outer(errors, errors), atol=2e-3)
@@ -48,8 +44,8 @@ def test_the_lobe_fit_is_scipys(lobe_fit):
     assert not lobe_fit.at_bound
     assert not any(combination.unconstrained for combination in lobe_fit.unidentified)
     # starts are counted
-    counts, costs = zip(*((minimum.count, minimum.cost) for minimum in lobe_fit.minima), strict=True)
-    assert list(costs) == sorted(costs)
+    counts = [minimum.count for minimum in lobe_fit.minima]
+    assert [minimum.cost for minimum in lobe_fit.minima] == sorted(minimum.cost for minimum in lobe_fit.minima)
     assert 4 <= counts[0] <= sum(counts) <= 16
     assert f"{counts[0]} of 16 starts" in lobe_fit.status
     assert lobe_fit.minima[0].values == pytest.approx(lobe_fit.values)
@@ -61,16 +57,12 @@ def test_the_lobe_fit_is_scipys(lobe_fit):
 
 
 def test_the_gradient_of_the_posterior_agrees_with_differences():
-    def value_and_gradient(model, u):
-        return jax.value_and_grad(model.log_posterior_unconstrained)(u)
-
-    problem = Problem(LOBE_STACK, noisy_lobe(0), lobe)
-    u = np.linspace(-1.0, 1.0, 6)
+    problem, u = Problem(LOBE_STACK, noisy_lobe(0), lobe), np.linspace(-1.0, 1.0, 6)
+    gradient = problem.call(lambda model, u: jax.grad(model.log_posterior_unconstrained)(u), u)
     # the error of central differences is about h^2 = 1e-8 relative, their rounding 1e-16 / h of the log-posterior
-    gradient, h = problem.call(value_and_gradient, u)[1], 1e-4
-    for index, step in enumerate(np.eye(6) * h):
-        up, down = (float(problem.call(value_and_gradient, u + sign * step)[0]) for sign in (1.0, -1.0))
-        np.testing.assert_allclose(gradient[index], (up - down) / (2.0 * h), rtol=1e-6)
+    for slope, step in zip(gradient, 1e-4 * np.eye(6), strict=True):
+        up, down = (float(problem.log_posterior_unconstrained(u + sign * step)) for sign in (1.0, -1.0))
+        np.testing.assert_allclose(slope, (up - down) / 2e-4, rtol=1e-6)
 
 
 def test_optimistix_runs_the_solver_within_the_box():
@@ -81,10 +73,9 @@ def test_optimistix_runs_the_solver_within_the_box():
             x = scale * y
             return jnp.stack([10.0 * (x[1] - x[0] ** 2), 1.0 - x[0]]), (x, x)
 
-        found = optx.least_squares(
-            residuals, BoxLevenbergMarquardt(), jnp.array([0.1, 0.9]), has_aux=True, max_steps=200
-        )
-        expected = least_squares(lambda y, of=residuals: np.asarray(of(y, None)[0]), [0.1, 0.9], bounds=(0.0, 1.0))
+        start = jnp.array([0.1, 0.9])
+        found = optx.least_squares(residuals, BoxLevenbergMarquardt(), start, has_aux=True, max_steps=200)
+        expected = least_squares(lambda y, of=residuals: np.asarray(of(y, None)[0]), start, bounds=(0.0, 1.0))
         np.testing.assert_allclose(found.value, expected.x, atol=1e-4)
         np.testing.assert_allclose(found.aux[0], scale * found.value, rtol=1e-6)
         np.testing.assert_allclose(found.stats["state"].watched, scale * np.eye(2), rtol=1e-6)
@@ -117,37 +108,28 @@ def test_a_parameter_beyond_its_bound_is_held_there_and_one_near_it_is_not():
     np.testing.assert_allclose(near.vector, optimum, atol=1e-6)
 
 
-def test_a_product_leaves_its_direction_open():
-    """Only a times b matters: log a minus log b is open, their sum is known, and no error comes out small."""
+@pytest.mark.parametrize("prior", [Uniform(), Normal(0.3, 0.2)])
+def test_a_sum_leaves_a_direction_open_and_a_prior_closes_it(prior):
+    """Only a plus b matters: it is known, a minus b is what the prior says, and no error comes out small."""
 
-    def product(stack, wi, wo):
-        return (stack["a"] * stack["b"] * wo[:, 2])[:, None]
-
-    data = measured(DESIGN[:, 1:] * 0.25, 0.01)
-    stack = {"a": Free(0.5, 0.1, 1.0, LogUniform()), "b": Free(0.5, 0.1, 1.0, LogUniform())}
-    result = fit(stack, data, transport=product, starts=4)
-    (combination,) = result.unidentified
-    assert combination.unconstrained
-    assert combination.error > 1e3
-    weights = combination.weights
-    assert weights[A] == pytest.approx(-weights[B], rel=1e-4)
-    assert abs(weights[A]) == pytest.approx(np.sqrt(0.5), rel=1e-4)
-    assert result.condition_number > 1e6
-    assert all(error > 0.5 for error in result.standard_errors.values())
-    assert result.values[A] * result.values[B] == pytest.approx(0.25, rel=1e-6)
-
-
-def test_a_prior_closes_an_open_direction():
     def total(stack, wi, wo):
         return (stack["a"] + stack["b"] + 0 * wo[:, 2])[:, None]
 
-    stack = {"a": Free(0.1, -2.0, 2.0, Normal(0.3, 0.2)), "b": Free(0.1, -2.0, 2.0)}
+    stack = {"a": Free(0.1, -2.0, 2.0, prior), "b": Free(0.1, -2.0, 2.0)}
     result = fit(stack, measured(np.full((COUNT, 1), 1.0), 0.01), transport=total, starts=4)
-    assert result.standard_errors[A] == pytest.approx(0.2, rel=1e-6)
-    left = np.sqrt(2.0 * COST_TOLERANCE) * 0.2  # a step that promises less ends the fit
-    assert result.values == pytest.approx({A: 0.3, B: 0.7}, abs=left)
-    (combination,) = result.unidentified  # it is the prior that decides, and the data are said not to
+    assert result.vector.sum() == pytest.approx(1.0, rel=1e-6)
+    (combination,) = result.unidentified  # also where it is the prior that decides
     assert combination.unconstrained
+    assert np.abs(list(combination.weights.values())) == pytest.approx([np.sqrt(0.5)] * 2, rel=1e-4)
+    if isinstance(prior, Normal):
+        assert result.standard_errors[A] == pytest.approx(0.2, rel=1e-6)
+        left = np.sqrt(2.0 * COST_TOLERANCE) * 0.2  # a step that promises less ends the fit
+        assert result.values == pytest.approx({A: 0.3, B: 0.7}, abs=left)
+    else:
+        assert combination.error > 1e3
+        assert combination.weights[A] * combination.weights[B] < 0.0
+        assert result.condition_number > 1e6
+        assert min(result.standard_errors.values()) > 0.5
 
 
 @pytest.mark.parametrize("strength", [0.0, 1e-170])
@@ -166,28 +148,21 @@ def test_parameters_with_hardly_any_effect_are_not_determined_and_no_error_overf
     assert result.at_bound == ()
     if not strength:
         assert result.condition_number == np.inf
-        assert set(map(repr, result.unidentified)) == {
-            repr(Direction(np.inf, {name: 1.0}, {name: np.inf})) for name in result.insensitive
-        }
+        expected = [Direction(np.inf, {name: 1.0}, {name: np.inf}) for name in result.insensitive]
+        assert sorted(map(repr, result.unidentified)) == sorted(map(repr, expected))
         assert verdicts.identifiability(result)["['c']"] == "insensitive: no effect on the data"
 
 
-@pytest.mark.parametrize("tails", ["gaussian", "student"])
-def test_free_noise_levels_are_recovered(tails):
-    """Maximum likelihood of a line with constant noise: known in closed form for Gaussian noise."""
-    generator = np.random.default_rng(2)
-    noise = generator.standard_normal((COUNT, 1)) if tails == "gaussian" else generator.standard_t(4.0, (COUNT, 1))
-    data = measured((DESIGN @ [1.0, 0.5])[:, None] + 0.07 * noise)
-    level = Noise(relative=0.0, floor=Free(0.5, 1e-4, 2.0), tails=tails)
+def test_free_noise_levels_are_recovered():
+    """Maximum likelihood of a line with constant noise, in closed form."""
+    data = measured(line_data(0.07, seed=2).values)
+    level = Noise(relative=0.0, floor=Free(0.5, 1e-4, 2.0))
     result = fit(LINE, data, transport=line, noise=level, starts=8)
     assert result.converged
-    sigma, error = result.values["noise.floor"], result.standard_errors["noise.floor"]
-    if tails == "gaussian":
-        np.testing.assert_allclose(result.vector[:2], regression(data), rtol=1e-5)
-        residuals = data.values[:, 0] - DESIGN @ regression(data)
-        assert sigma == pytest.approx(np.sqrt(np.mean(residuals**2)), rel=1e-5)
-        assert error == pytest.approx(sigma / np.sqrt(2 * COUNT), rel=1e-5)
-    assert abs(sigma - 0.07) < 4 * error
+    np.testing.assert_allclose(result.vector[:2], regression(data), rtol=1e-5)
+    sigma = np.sqrt(np.mean((data.values[:, 0] - DESIGN @ regression(data)) ** 2))
+    assert result.values["noise.floor"] == pytest.approx(sigma, rel=1e-5)
+    assert result.standard_errors["noise.floor"] == pytest.approx(sigma / np.sqrt(2 * COUNT), rel=1e-5)
     assert result.units["noise.floor"] == "1/sr"
 
 
@@ -199,26 +174,30 @@ def test_student_tails_shrug_off_outliers():
         assert (abs(found.values[A] - 1.0) < 4 * found.standard_errors[A]) == (tails == "student")
 
 
-def test_a_scale_with_its_prior():
-    """Only scale times (a, b) is known; the prior on the logarithm decides the scale, and gives its error."""
-    scale = Free(1.0, 0.5, 2.0, LogNormal(1.1, 0.05))
-    result = fit(LINE, line_data(), transport=line, scale=scale, starts=4)
-    assert result.values["scale"] == pytest.approx(1.1, rel=1e-5)
-    assert result.standard_errors["scale"] == pytest.approx(0.05 * 1.1, rel=1e-4)
-    np.testing.assert_allclose(result.vector[:2] * result.values["scale"], regression(line_data()), rtol=1e-5)
-
-
 def test_a_named_residual_is_no_posterior():
     data = line_data()
     result = fit(LINE, data, transport=line, objective="cosine_l2", starts=4)
-    weighted = DESIGN * np.abs(data.wi[:, 2:])
-    target = data.values[:, 0] * np.abs(data.wi[:, 2])
-    found, sum_of_squares = np.linalg.lstsq(weighted, target, rcond=None)[:2]
+    weighted = data.wi[:, 2:] * DESIGN
+    found, sum_of_squares = np.linalg.lstsq(weighted, data.wi[:, 2] * data.values[:, 0], rcond=None)[:2]
     covariance = np.linalg.inv(weighted.T @ weighted) * sum_of_squares[0] / (COUNT - 2)
     np.testing.assert_allclose(result.vector, found, rtol=1e-6)
     np.testing.assert_allclose(result.errors, np.sqrt(np.diagonal(covariance)), rtol=1e-6)
     assert not result.is_posterior
     assert np.isnan(result.log_likelihood)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("discrepancy", [False, True])
+def test_fits_do_as_well_where_a_user_forbids_arrays_of_different_ranks_to_broadcast(discrepancy: bool) -> None:
+    """That is of their own code; starts run in threads, which have settings of their own."""
+    noise = Noise(relative=0.02, floor=1e-4, discrepancy=discrepancy)
+    jax.clear_caches()  # nothing that was traced before is taken for this
+    with jax.numpy_rank_promotion("raise"):
+        found = fit(LINE, line_data(), transport=line, noise=noise, starts=3)
+        assert found.values[A] == pytest.approx(1.0, abs=0.3)
+        assert verdicts.summary(found)
+        assert np.isfinite(evidence(found).log_evidence)
+        assert np.all(np.isfinite(predict(found, slices([30.0]), draws=8).bsdf.mean))
 
 
 def test_starts_that_fail_are_counted_and_not_believed():
@@ -236,7 +215,6 @@ def test_starts_that_fail_are_counted_and_not_believed():
 
 
 def test_a_medium_over_a_base_is_recovered():
-
     def stack(thickness, albedo, g, base):
         return lj.Stack([lj.Medium(thickness, albedo, lj.HenyeyGreenstein(g))], lj.Lambertian(base))
 
@@ -261,22 +239,3 @@ def test_what_is_known_of_the_stack_stays_known_in_a_fit():
     exact = simulate(coat(0.3), geometry, transport).values
     np.testing.assert_allclose(problem.predict([0.3]), exact, rtol=1e-9)
     assert all(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(problem.build([0.3]).stack))
-
-
-PAINT = lj.Stack([], lj.Lambertian(Free(0.5, 0.0, 1.0)))
-
-
-@pytest.mark.parametrize(
-    ("call", "message"),
-    [
-        (lambda: Problem(PAINT, line_data(), lj.RandomWalk()), "RandomWalk is random; use a deterministic one"),
-        (lambda: simulate(PAINT, slices(), lj.RandomWalk()), "RandomWalk is random"),
-        (lambda: simulate(PAINT, slices(), noise=5), r"noise is 5; it must be a number in \[0, "),
-        (lambda: Problem(PAINT, line_data(), lj.AddingDoubling(tolerance=0.01)), "0.01 needs concrete parameters"),
-        (lambda: FitOptions(same_cost=0.0), r"FitOptions.same_cost is 0.0; it must be a number in \(0, inf\)"),
-        (lambda: options_from({"tolerance": 1.0}), r"\[options\] has an unknown key 'tolerance'; allowed: same_v"),
-    ],
-)
-def test_refused(call, message):
-    with pytest.raises(ValueError, match=message):
-        call()

@@ -20,9 +20,8 @@ def test_a_sum_that_alone_is_known_is_told_from_its_parts():
     (combination,) = unidentified_directions(root, ("x", "y", "z"), np.array([10.0, 1.0, 1.0]))
     assert combination.error == pytest.approx(np.sqrt(2.0))  # the row x - y of length 1 / sqrt(2)
     assert combination.unconstrained
-    assert list(combination.weights) == ["x", "y"]
-    assert combination.weights["x"] == pytest.approx(-combination.weights["y"])
-    assert combination.weights["x"] ** 2 == pytest.approx(0.5)
+    x, y = combination.weights["x"], combination.weights["y"]
+    assert (list(combination.weights), [x * x, x * y]) == (["x", "y"], pytest.approx([0.5, -0.5]))
     # each alone: 1 / sqrt(100^2 + 0.5^2) boxes
     assert combination.conditional_errors == pytest.approx({"x": 0.1, "y": 0.01}, rel=1e-4)
 

@@ -20,21 +20,16 @@ def data(name):
     return measured((design(COUNTS[name]) @ TRUE[name])[:, None] + SIGMA[name] * noise, SIGMA[name])
 
 
-FLAT = fits.Uniform()
-
-
-def problem(name, prior=FLAT):
-    return fits.Problem({"a": fits.Free(0.9, -1.0, 3.0), "b": fits.Free(0.1, -1.0, 3.0, prior)}, data(name), line)
+def problem(name, slope=LINE["b"], **given):
+    return fits.Problem(LINE | {"b": slope}, data(name), line, **given)
 
 
 def least_squares(prior):
     """Slope and the two offsets in closed form, with their covariance."""
     rows, targets = [], []
-    for index, name in enumerate(TRUE):
-        offset, cosine = design(COUNTS[name]).T
-        columns = np.zeros((COUNTS[name], 3))
-        columns[:, 0], columns[:, 1 + index] = cosine, offset
-        rows.append(columns / SIGMA[name])
+    for name, offsets in zip(TRUE, np.eye(2), strict=True):
+        cosine = design(COUNTS[name])[:, 1:]
+        rows.append(np.hstack([cosine, np.tile(offsets, (len(cosine), 1))]) / SIGMA[name])
         targets.append(data(name).values[:, 0] / SIGMA[name])
     if prior:
         rows.append(np.array([[1.0, 0.0, 0.0]]) / PRIOR.sd)
@@ -58,13 +53,13 @@ def test_it_is_least_squares(joint):
     at = order(joint)
     np.testing.assert_allclose(joint.vector[at], expected, atol=1e-6)
     np.testing.assert_allclose(joint.covariance[np.ix_(at, at)], covariance, rtol=1e-6)
-    np.testing.assert_allclose(joint.errors[at], np.sqrt(np.diagonal(covariance)), rtol=1e-6)
     assert joint.degrees_of_freedom == sum(COUNTS.values()) - 3
     residuals = np.concatenate([joint.part(name).residuals for name in TRUE])
     assert joint.chi_square == pytest.approx(np.sum(residuals**2))
     assert joint.log_likelihood == pytest.approx(sum(joint.part(name).log_likelihood for name in TRUE))
     # the prior of what is shared counts once
-    found = fits.fit(fits.Joint({name: problem(name, PRIOR) for name in TRUE}, shared=[SLOPE]), starts=1)
+    slope = fits.Free(0.1, -1.0, 3.0, PRIOR)
+    found = fits.fit(fits.Joint({name: problem(name, slope) for name in TRUE}, shared=[SLOPE]), starts=1)
     expected, covariance = least_squares(prior=True)
     np.testing.assert_allclose(found.vector[order(found)], expected, atol=1e-5)
     np.testing.assert_allclose(found.covariance[np.ix_(order(found), order(found))], covariance, rtol=1e-6)
@@ -79,14 +74,19 @@ def test_a_part_is_a_fit_of_its_own(joint):
     assert first.minima[0].values == first.values
     with pytest.raises(ValueError, match="part 'third' is not one of first, second"):
         joint.part("third")
+    # it predicts with what all of them say
+    at = fits.slices(incidence=(10,))
+    columns = np.stack([at.wo[:, 2], np.ones(len(at)), np.zeros(len(at))], axis=-1)
+    _, covariance = least_squares(prior=False)
+    sd = np.sqrt(np.sum(columns @ covariance * columns, axis=-1))
+    np.testing.assert_allclose(fits.predict(first, at, draws=4000).sd[:, 0], sd, rtol=0.06)  # of 4000 draws by weight
 
 
 def test_what_takes_the_other_of_whole_and_part(joint):
     """What asks the data anew takes the whole, what shows or keeps one measurement a part."""
-    first = joint.part("first")
     for ask in (fits.sample, fits.evidence, fits.cross_validate):
         with pytest.raises(ValueError, match=f"{ask.__name__}: 'first' is a part of a joint fit"):
-            ask(first)
+            ask(joint.part("first"))
     with pytest.raises(ValueError, match="cross_validate: it takes a fit of one measurement by itself, not a joint"):
         fits.cross_validate(joint)
     chain = np.tile(joint.vector, (20, 2, 1))
@@ -102,15 +102,6 @@ def test_what_takes_the_other_of_whole_and_part(joint):
             ask()
 
 
-def test_a_part_predicts_with_what_all_of_them_say(joint):
-    at = fits.slices(incidence=(10,))
-    seen = fits.predict(joint.part("first"), at, draws=4000)
-    columns = np.stack([at.wo[:, 2], np.ones(len(at)), np.zeros(len(at))], axis=-1)
-    _, covariance = least_squares(prior=False)
-    sd = np.sqrt(np.sum(columns @ covariance * columns, axis=-1))
-    np.testing.assert_allclose(seen.sd[:, 0], sd, rtol=0.06)  # of 4000 draws by weight
-
-
 def test_the_posterior_is_that_of_all(joint):
     found = fits.sample(joint, ess=1000, seed=1)
     expected, covariance = least_squares(prior=False)
@@ -123,34 +114,13 @@ def test_the_posterior_is_that_of_all(joint):
     assert part.inference_data.posterior_predictive["value"].shape[-2:] == (COUNTS["second"], 1)
 
 
-@pytest.mark.slow
-def test_measurements_that_share_nothing_are_each_alone():
-    values = design(60) @ [0.9, 0.4]
-    noise = np.random.default_rng(3).standard_normal((2, 60)) * [[0.03], [0.05]]
-    noises = {
-        "level": fits.Noise(relative=fits.Free(0.1, 0.001, 1.0, fits.LogNormal(0.05, 2.0))),
-        "shared": fits.Noise(0.02, discrepancy=fits.Discrepancy(length_half=10.0, length_difference=10.0)),
-    }
-    problems = {
-        name: fits.Problem(LINE, measured((values * (1 + part))[:, None]), line, assumed)
-        for (name, assumed), part in zip(noises.items(), noise, strict=True)
-    }
-    together = fits.fit(fits.Joint(problems), starts=3)
-    for name, one in problems.items():
-        alone = fits.fit(LINE, one.data, transport=line, noise=one.noise, starts=3)
-        np.testing.assert_allclose(together.part(name).vector, alone.vector, rtol=1e-4)
-        np.testing.assert_allclose(together.part(name).errors, alone.errors, rtol=1e-3)
-        np.testing.assert_allclose(together.part(name).residuals, alone.residuals, atol=1e-3)
-
-
 def test_what_is_new_in_one_measurement_is_not_shared():
-    """Errors that readings of one of them share have names that begin as those of levels of noise do."""
+    """Names of a discrepancy begin as those of levels of noise do."""
     noise = fits.Noise(relative=fits.Free(0.1, 0.01, 1.0))
-    both = fits.Joint({name: fits.Problem(LINE, data(name), line, noise) for name in TRUE}, shared=["noise", SLOPE])
+    both = fits.Joint({name: problem(name, noise=noise) for name in TRUE}, shared=["noise", SLOPE])
     changed = both.with_problems({"first": replace(both.parts["first"], noise=replace(noise, discrepancy=True))})
     added = set(changed.names) - set(both.names)
-    assert len(added) == 4
-    assert all(name.startswith("first.noise.discrepancy.") for name in added)
+    assert [name.startswith("first.noise.discrepancy.") for name in added] == [True] * 4
 
 
 def test_each_measurement_is_differentiated_by_its_own_parameters():
@@ -163,24 +133,18 @@ def test_each_measurement_is_differentiated_by_its_own_parameters():
         np.testing.assert_array_equal(own.slopes, known.slopes)
 
 
-FIRST, SECOND = (problem(name) for name in TRUE)
-FIXED = fits.Problem({"a": fits.Free(0.9, -1.0, 3.0), "b": 0.5}, data("second"), line)
-OTHER = fits.Problem({"a": fits.Free(0.9, -1.0, 3.0), "b": fits.Free(0.1, -1.0, 2.0)}, data("second"), line)
-NAMED = fits.Problem(LINE, data("second"), line, objective="cosine_l2")
-
-
-@pytest.mark.parametrize(
-    ("call", "message"),
-    [
-        (lambda: fits.Joint({"a": FIRST}), r"Joint.parts is \['a'\]; it must name at least two problems"),
-        (lambda: fits.Joint({"a": FIRST, "b": SECOND}, ["scale"]), "no problem has a free parameter 'scale'"),
-        (lambda: fits.Joint({"a": FIRST, "b": FIXED}, [SLOPE]), r"\['b'\] is not free in 'b'; it must be in every"),
-        (lambda: fits.Joint({"a": FIRST, "b": OTHER}, [SLOPE]), r"\['b'\] has other bounds or another prior in 'b'"),
-        (lambda: fits.Joint({"a": FIRST, "b": NAMED}), "objective is 'cosine_l2'; it must be 'likelihood'"),
-        (lambda: fits.fit(fits.Joint({"a": FIRST, "b": SECOND}), data("first")), "data is given beside a Joint"),
-        (lambda: fits.fit(fits.Joint({"a": FIRST, "b": SECOND}), transport=line), "transport is given beside a Joint"),
-    ],
-)
-def test_refused(call, message):
-    with pytest.raises(ValueError, match=message):
-        call()
+def test_refused(joint):
+    whole, (first, second) = joint.problem, joint.problem.parts.values()
+    fixed, other = problem("second", 0.5), problem("second", fits.Free(0.1, -1.0, 2.0))
+    named = problem("second", objective="cosine_l2")
+    for call, message in (
+        (lambda: fits.Joint({"a": first}), r"Joint.parts is \['a'\]; it must name at least two problems"),
+        (lambda: fits.Joint({"a": first, "b": second}, ["scale"]), "no problem has a free parameter 'scale'"),
+        (lambda: fits.Joint({"a": first, "b": fixed}, [SLOPE]), r"\['b'\] is not free in 'b'; it must be in every"),
+        (lambda: fits.Joint({"a": first, "b": other}, [SLOPE]), r"\['b'\] has other bounds or another prior in 'b'"),
+        (lambda: fits.Joint({"a": first, "b": named}), "objective is 'cosine_l2'; it must be 'likelihood'"),
+        (lambda: fits.fit(whole, data("first")), "data is given beside a Joint"),
+        (lambda: fits.fit(whole, transport=line), "transport is given beside a Joint"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            call()

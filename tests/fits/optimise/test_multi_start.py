@@ -11,11 +11,11 @@ from fits.optimise import multi_start as starts_module
 from fits.optimise.levenberg_marquardt import evaluate_at
 from fits.optimise.multi_start import LEAST_GAIN, multi_start, start_points, starts_store, unit_of
 from fits.optimise.result import OUTCOMES
-from tests.helpers.models import LINE, LOBE, LOBE_STACK, directions, line, line_data, lobe, measured, noisy_lobe
+from tests.helpers.models import LINE, LOBE_STACK, line, line_data, lobe, noisy_lobe
 from tests.helpers.places import COATINGS, EXAMPLES
 from tests.helpers.stores import keys
 
-STEEL = COATINGS / "nite_on_blasted_steel1008_650nm_inplane.csv"
+STEEL = read(COATINGS / "nite_on_blasted_steel1008_650nm_inplane.csv").select(incidence=(10.0, 50.0))
 
 
 def cost_at(problem, values):
@@ -27,13 +27,13 @@ def cost_at(problem, values):
 @pytest.mark.slow
 def test_a_stack_never_ends_above_what_it_contains():
     """A haze over flakes on paint: the flakes on paint, beside steel."""
-    data, ends = read(STEEL).select(incidence=(10.0, 50.0)), {}
+    ends = []
     for name in ("hazy_coat_over_diffuse", "flake_coat_over_diffuse"):
         given = read_problem(EXAMPLES / f"{name}.toml")
         # the cheapest transport: what is asked is about starts, whatever carries the light
         options = {"transport": lj.SingleScattering(), "noise": given.noise, "scale": given.scale}
-        ends[name] = fit(given.stack, data, starts=8, **options)
-    whole, part = ends.values()
+        ends.append(fit(given.stack, STEEL, starts=8, **options))
+    whole, part = ends
     values = {name.replace("layers[0]", "layers[1]"): value for name, value in part.values.items()}
     # to what a start that goes on is worth
     assert whole.minima[0].cost <= cost_at(whole.problem, values) + LEAST_GAIN
@@ -42,9 +42,8 @@ def test_a_stack_never_ends_above_what_it_contains():
 def test_a_race_ends_where_all_starts_do(monkeypatch):
     """Of a stack with several minima; few steps tell which starts go on, and the others are not followed."""
     given = read_problem(EXAMPLES / "hazy_coat_over_diffuse.toml")
-    data = read(STEEL).select(incidence=(10.0, 50.0))
-    problem = Problem(given.stack, data, lj.SingleScattering(), replace(given.noise, discrepancy=False), given.scale)
-    points = starts_module.start_points(problem, 8, 0)
+    problem = Problem(given.stack, STEEL, lj.SingleScattering(), replace(given.noise, discrepancy=False), given.scale)
+    points = start_points(problem, 8, 0)
     monkeypatch.setattr(starts_module, "EARLY", 10)
     ends = starts_module.screened_starts(problem, points)
     every = multi_start(problem, points, lambda *_: None)
@@ -58,9 +57,8 @@ def test_the_lowest_end_is_the_fit_though_it_ran_out_of_steps(monkeypatch):
     monkeypatch.setattr(starts_module, "MOST_ROUNDS", 1)
     calls = []
     # a stack of its own, so that the program is compiled with this number of steps
-    exact = lobe(LOBE, directions(200, 1), directions(200, 2))
-    data = measured(exact, 0.01 * exact)
-    result = fit(LOBE_STACK, data, transport=lambda *a: lobe(*a), starts=6, progress=lambda *a: calls.append(a))
+    how = {"transport": lambda *a: lobe(*a), "progress": lambda *a: calls.append(a)}
+    result = fit(LOBE_STACK, noisy_lobe(0, 200), starts=6, **how)
     seen = min(float(call[3].split()[-1]) for call in calls)
     assert result.minima[0].cost <= seen * (1 + 1e-5)
     assert sum(result.start_outcomes.values()) == 6
@@ -90,17 +88,9 @@ def test_starts_are_those_of_the_same_fit_only(tmp_path):
     fit(LINE, line_data(), transport=line, starts=4, checkpoint=path)
     written = path.read_bytes()
     assert kept() == 4
-    others = [
-        {"count": 5},
-        {"seed": 1},
-        {"data": line_data(seed=1)},
-        {"noise": Noise(tails="student")},
-        {"objective": "cosine_l2"},
-        {"scale": 1.01},
-        {"stack": {**LINE, "b": LINE["b"].start}},
-        {"transport": lambda stack, wi, wo: 2.0 * line(stack, wi, wo)},
-    ]
-    assert [kept(**other) for other in others] == [0] * len(others)
+    changes = {"data": line_data(seed=1), "noise": Noise(tails="student"), "objective": "cosine_l2", "scale": 1.01}
+    changes |= {"stack": LINE | {"b": 0.1}, "transport": lambda *given: 2.0 * line(*given), "count": 5, "seed": 1}
+    assert {name: kept(**{name: other}) for name, other in changes.items()} == dict.fromkeys(changes, 0)
 
 
 @pytest.mark.slow

@@ -14,7 +14,7 @@ from tests.helpers.models import LINE, TRUTH, line, line_data
 
 GEOMETRY = slices(incidence=(20, 50), outgoing=np.arange(-60, 61, 20))
 NARROW, WIDE = 0.8, 0.3
-COARSE = lj.AddingDoubling(nodes=12, modes=16, ordinates=(8, 12))
+COARSE, FINE = lj.AddingDoubling(nodes=12, modes=16, ordinates=(8, 12)), lj.AddingDoubling(nodes=32, modes=48)
 
 
 def hazy(g):
@@ -26,7 +26,7 @@ STACK = hazy(Free(WIDE, -0.5, 0.95))  # wide where it starts: 12 nodes will do t
 
 
 def measured(g, noise):
-    return simulate(hazy(g), GEOMETRY, transport=lj.AddingDoubling(nodes=32, modes=48), noise=noise, seed=0)
+    return simulate(hazy(g), GEOMETRY, transport=FINE, noise=noise, seed=0)
 
 
 @pytest.fixture(scope="module")
@@ -50,24 +50,17 @@ def test_a_fit_is_refined_until_its_error_is_a_tenth_of_the_noise(refined, sharp
     assert found.resolution == f"{transport.nodes} nodes, {transport.modes} modes"
     assert f"numerical error of the model: {found.numerical_error:.2g} sigma at most" in found.status
     # against the resolution that made the data, the error is what is said, within the factor of one more rung
-    exact = lj.evaluate(
-        hazy(found.values["layers[0].phase.g"]), sharp.wi, sharp.wo, lj.AddingDoubling(nodes=32, modes=48)
-    )
+    exact = lj.evaluate(hazy(found.values["layers[0].phase.g"]), sharp.wi, sharp.wo, FINE)
     assert np.max(np.abs(found.predicted - exact) / sharp.sigma) < 2.0 * DEFAULT.numerical_error
     assert abs(found.values["layers[0].phase.g"] - NARROW) < 3.0 * found.standard_errors["layers[0].phase.g"]
     assert found.converged
     assert found.minima[0].count == 2
 
 
-def is_coarse(transport):
-    """In nodes and modes: no medium here asks for ordinates."""
-    return (transport.nodes, transport.modes) == (COARSE.nodes, COARSE.modes)
-
-
 @pytest.mark.slow
 def test_a_coarse_one_stays_where_it_will_do():
     found = fit(STACK, measured(WIDE, 0.05), starts=1)
-    assert is_coarse(found.problem.transport)
+    assert found.resolution == "12 nodes, 16 modes"
     assert found.numerical_error <= DEFAULT.numerical_error
 
 
@@ -85,13 +78,10 @@ def test_the_finest_resolution_is_told(sharp, monkeypatch):
     monkeypatch.setattr(resolution_module, "FINEST_NODES", COARSE.nodes)
     monkeypatch.setattr(resolution_module, "FINEST_MODES", COARSE.modes)
     found = fit(STACK, sharp, starts=1)
-    assert is_coarse(found.problem.transport)
     assert found.resolution == "12 nodes, 16 modes, the finest tried"
 
 
-def test_a_fit_resumes_with_the_starts_that_are_done_and_is_kept_with_its_resolution(
-    refined, sharp, monkeypatch, tmp_path
-):
+def test_a_fit_resumes_after_its_starts_and_is_kept_with_its_resolution(refined, sharp, monkeypatch, tmp_path):
     found, kept = refined
     monkeypatch.setattr(starts_module, "rough_descent", pytest.fail)  # no start is run again
     again = fit(STACK, sharp, starts=2, checkpoint=kept)
@@ -102,16 +92,12 @@ def test_a_fit_resumes_with_the_starts_that_are_done_and_is_kept_with_its_resolu
         assert (other.resolution, other.numerical_error) == (found.resolution, found.numerical_error)
 
 
-def coated(index, alpha):
-    flakes = lj.SGGX("surface", alpha=alpha)
-    return lj.Stack([lj.Interface(ior=index, alpha=0.1), lj.Medium(thickness=1.0, albedo=0.9, phase=flakes)])
-
-
 def test_what_auto_is_does_not_follow_from_the_start():
     """An interface that starts without effect is one, and a roughness counts with its value at the start."""
     geometry = slices(incidence=(20,), outgoing=(0, 30))
     data = simulate(lj.Stack([], base=lj.Lambertian(albedo=0.5)), geometry, noise=0.1)
-    passing = resolutions(Problem(coated(Free(1.0, 1.0, 2.0), Free(0.1, 0.05, 1.0)), data))
+    flakes = lj.Medium(thickness=1.0, albedo=0.9, phase=lj.SGGX("surface", alpha=Free(0.1, 0.05, 1.0)))
+    passing = resolutions(Problem(lj.Stack([lj.Interface(Free(1.0, 1.0, 2.0), 0.1), flakes]), data))
     assert passing.open
     assert not passing.tilted
     assert passing.chosen.nodes > passing.far.nodes == resolution_module.FAR["nodes"]

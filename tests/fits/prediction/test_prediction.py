@@ -15,26 +15,17 @@ from tests.helpers.models import COUNT, POSITIVE_LINE, along, design, directions
 SIGMA = 0.02
 
 
-def measurements(seed: int, wrong: float, sigma: float = SIGMA) -> Measurements:
-    """Of the line, with smooth errors relative to it, of another shape in every set, and noise."""
-    return wrong_line(seed, Discrepancy(max(wrong, 1e-6), 12.0, 12.0, 0.0), sigma)
-
-
-def split(data: Measurements) -> tuple[Measurements, Measurements]:
+def split(seed: int, wrong: float, sigma: float = SIGMA) -> tuple[Measurements, Measurements]:
+    """Two incidences, and two that are held out, of the line with smooth errors relative to it, and noise."""
+    data = wrong_line(seed, Discrepancy(max(wrong, 1e-6), 12.0, 12.0, 0.0), sigma)
     held = select(data, "incidence=30,70")
     return data.where(~held), data.where(held)
-
-
-def fitted_to(data: Measurements, discrepancy: bool = True) -> Fit:
-    noise = Noise(relative=SIGMA, floor=1e-4, discrepancy=discrepancy)
-    return fit(POSITIVE_LINE, data, transport=line, noise=noise, starts=2)
 
 
 def test_intervals_of_a_line_are_those_of_regression(result: Fit) -> None:
     at = predict(result, result.problem.data, draws=4000)
     columns = design(COUNT)
-    covariance = np.linalg.inv(columns.T @ columns / 0.05**2)
-    expected = np.sqrt(np.sum(columns @ covariance * columns, axis=-1))
+    expected = 0.05 * np.sqrt(np.sum(columns @ np.linalg.inv(columns.T @ columns) * columns, axis=-1))
     # 4,000 draws: 1.5 % of a standard deviation, at 4 standard errors
     np.testing.assert_allclose(at.latent.sd[:, 0], expected, rtol=0.06)
     np.testing.assert_allclose(at.predictive.sd[:, 0], np.sqrt(expected**2 + 0.05**2), rtol=0.05)
@@ -52,23 +43,9 @@ def test_intervals_of_a_line_are_those_of_regression(result: Fit) -> None:
 
 
 @pytest.mark.slow
-def test_wrong_models_need_a_discrepancy() -> None:
-    """Of 10 sets whose model is wrong by 10 %: intervals cover what they say, those of independent noise do not."""
-    sets = [split(measurements(seed, 0.1)) for seed in range(10)]
-    with_it, alone = (
-        [predict(fitted_to(fitted, discrepancy), held_out).scores for fitted, held_out in sets]
-        for discrepancy in (True, False)
-    )
-    # 82 held-out measurements a set are correlated: the standard error of the mean of 10 sets is about 0.03
-    assert 0.86 < np.mean([one.coverage[0.95] for one in with_it]) < 0.99
-    assert np.mean([one.coverage[0.95] for one in alone]) < 0.7
-    assert np.mean([one.elpd - other.elpd for one, other in zip(with_it, alone, strict=True)]) > 1.0
-
-
-@pytest.mark.slow
 def test_quantiles_are_those_of_the_draws_and_hold_what_they_say() -> None:
-    fitted, held_out = split(measurements(3, 0.1))
-    at = predict(fitted_to(fitted), held_out)
+    (fitted, held_out), noise = split(3, 0.1), Noise(relative=SIGMA, floor=1e-4, discrepancy=True)
+    at = predict(fit(POSITIVE_LINE, fitted, transport=line, noise=noise, starts=2), held_out)
     assert not np.array_equal(at.mean, at.latent.mean)
     # a measurement adds independent noise: of the logarithm, which is the relative deviation here
     np.testing.assert_allclose(at.scales**2, at.discrepancy_sd**2 + SIGMA**2, rtol=1e-3)
@@ -84,7 +61,7 @@ def test_quantiles_are_those_of_the_draws_and_hold_what_they_say() -> None:
     assert expected > 0.9
     # the truth is known, as the discrepancy is drawn before the noise: of a stack that is wrong by 10 % the interval
     # holds few of it, that of the BSDF, with its discrepancy, what it says
-    truth = split(measurements(3, 0.1, sigma=0.0))[1].used().values
+    truth = split(3, 0.1, sigma=0.0)[1].used().values
     within = [np.mean((of.quantiles[0] < truth) & (truth < of.quantiles[-1])) for of in (at.latent, at.bsdf)]
     assert within[0] < 0.6
     assert within[1] > 0.85
@@ -98,28 +75,18 @@ def test_directions_below_an_opaque_stack_are_refused(coat_fit: Fit) -> None:
     assert np.all(predict(coat_fit, slices([89.9]), draws=8).mean > 0.0)
 
 
-@pytest.mark.slow
-def test_right_models_lose_little_by_it() -> None:
-    fitted, held_out = split(measurements(1, 0.0))
-    found = fitted_to(fitted)
-    assert found.values["noise.discrepancy.amplitude"] < SIGMA
-    got = predict(found, held_out).scores
-    assert got.coverage[0.95] > 0.9
-    assert got.median_error < SIGMA
-
-
 def test_noise_elsewhere_is_that_of_what_was_fitted() -> None:
-    fitted, _ = split(measurements(2, 0.0))
+    fitted, _ = split(2, 0.0)
     known = replace(fitted, sigma=SIGMA * fitted.values)
     found = fit(POSITIVE_LINE, known, transport=line, starts=2)
-    at, again = (predict(found, slices([30.0], np.arange(-60.0, 61.0, 20.0))) for _ in range(2))
+    at, again = (predict(found, slices([30.0], [-60.0, -20.0, 0.0, 40.0])) for _ in range(2))
     np.testing.assert_allclose(at.scales, SIGMA * np.abs(at.means), rtol=0.05)
     np.testing.assert_array_equal(at.predictive.quantiles, again.predictive.quantiles)
 
 
 def test_bad_requests_are_refused(result: Fit) -> None:
     data, at = result.problem.data, predict(result, slices([30.0]), draws=2)
-    named = fit(POSITIVE_LINE, data, transport=line, objective="cube_root", starts=1)
+    named = replace(result, problem=replace(result.problem, objective="cube_root"))
     for call, message in (
         (lambda: at.quantile(0.0), r"level is 0.0; it must be a number in \(0, 1\)"),
         (lambda: at.predictive_quantile(1.0), r"level is 1.0; it must be a number in \(0, 1\)"),
@@ -145,8 +112,7 @@ def test_intervals_of_a_product_hold_though_its_factors_are_unidentified(sigma) 
     data = measured(exact + noise, sigma)
     found = fit({"a": Free(1.0, 0.1, 10.0), "b": Free(0.9, 0.0, 10.0)}, data, transport=product, starts=4)
     at = predict(found, data, draws=1000)
-    expected = exact[:, 0] * sigma / np.sqrt(np.sum(exact**2))
-    ratio = at.latent.sd[:, 0] / expected
+    ratio = at.latent.sd[:, 0] / (exact[:, 0] * sigma / np.sqrt(np.sum(exact**2)))
     # reliable weights have some hundred effective draws, 4 standard errors of whose deviation are 0.2; others make
     # intervals wider, never narrower
     assert np.all(ratio > 0.8)

@@ -12,7 +12,7 @@ import scipy.linalg  # noqa: F401 (what JAX's matrices are solved by)
 from jax.experimental import io_callback
 from threadpoolctl import threadpool_info, threadpool_limits
 
-from fits.problem import compilation as compiled
+from fits.problem import compilation
 from fits.problem.compilation import Static, one_thread, run
 
 
@@ -22,12 +22,10 @@ def threads() -> set[int]:
 
 
 def most(model: tuple[()]) -> jax.Array:
-    """Seen from within a program."""
     return io_callback(lambda: np.int32(max(threads())), jax.ShapeDtypeStruct((), jnp.int32))
 
 
 def test_matrices_are_solved_by_one_thread_and_the_others_come_back_after_the_last_call() -> None:
-    """Also of programs that other threads run, when this one has set a limit before."""
     arrays, static = eqx.partition((), eqx.is_array)
     with threadpool_limits(2), ThreadPoolExecutor(2) as pool:
         program = (arrays, Static(static))
@@ -47,10 +45,8 @@ def test_matrices_are_solved_by_one_thread_and_the_others_come_back_after_the_la
 @pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/maps").exists(), reason="counts maps")
 @pytest.mark.parametrize(("full", "traced"), [(0.0, 2), (1.0, 1)])
-def test_programs_go_where_a_process_has_no_room_for_more(
-    monkeypatch: pytest.MonkeyPatch, full: float, traced: int
-) -> None:
-    monkeypatch.setattr(compiled, "FULL", full)
+def test_programs_go_where_a_process_has_no_room_for_more(monkeypatch, full: float, traced: int) -> None:
+    monkeypatch.setattr(compilation, "FULL", full)
     seen = []
 
     @jax.jit
@@ -59,6 +55,6 @@ def test_programs_go_where_a_process_has_no_room_for_more(
         return 2.0 * x
 
     program(1.0)
-    compiled.make_room()
+    compilation.make_room()
     program(1.0)
     assert len(seen) == traced

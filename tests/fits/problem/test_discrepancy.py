@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy import stats
+from scipy.spatial.transform import Rotation
 
 from fits import Discrepancy, Free, LogNormal, Measurements, Noise, Problem, slices
 from fits.data.measurements import channel_names
@@ -12,7 +13,6 @@ from fits.problem.discrepancy import Correlation, make_process, places
 from fits.problem.model import Model
 from tests.helpers.models import along
 
-FREE = Free(0.4, 0.0, 1.0)
 LAYOUTS = {
     "one scan": slices([30.0], np.arange(-80.0, 81.0, 8.0)),
     "two incidences": slices([10.0, 50.0], np.arange(-80.0, 81.0, 8.0)),
@@ -31,8 +31,7 @@ def transport(stack, wi, wo):
 
 def problem(layout: str, channels: int = 1, relative: float | Free = 0.01, **correlated) -> Problem:
     """A stack of one free number, fitted to noise about it."""
-    geometry = LAYOUTS[layout]
-    stack = {"a": FREE, "colour": np.linspace(1.0, 0.5, channels)}
+    geometry, stack = LAYOUTS[layout], {"a": Free(0.4, 0.0, 1.0), "colour": np.linspace(1.0, 0.5, channels)}
     exact = np.asarray(transport(stack | {"a": 0.5}, geometry.wi, geometry.wo))
     scatter = np.random.default_rng(len(geometry)).standard_normal(exact.shape)
     data = along(geometry, exact * (1.0 + 0.1 * scatter), 0.02 * exact, channel_names(channels))
@@ -54,11 +53,7 @@ def folded(data: Measurements) -> np.ndarray:
         half = (one + other) / np.linalg.norm(one + other)
         tilt, azimuth = np.arccos(min(half[2], 1.0)), np.arctan2(half[1], half[0])
         # Rusinkiewicz 1998: turn the half vector onto the normal, about z and then about y
-        turn = np.array(
-            [[np.cos(azimuth), np.sin(azimuth), 0.0], [-np.sin(azimuth), np.cos(azimuth), 0.0], [0.0, 0.0, 1.0]]
-        )
-        lean = np.array([[np.cos(tilt), 0.0, -np.sin(tilt)], [0.0, 1.0, 0.0], [np.sin(tilt), 0.0, np.cos(tilt)]])
-        difference = lean @ turn @ one
+        difference = Rotation.from_euler("zy", [-azimuth, -tilt]).apply(one)
         theta = np.degrees(np.arccos(np.clip(difference[2], -1.0, 1.0)))
         length = np.hypot(*difference[:2])
         cosine, sine = np.abs(difference[:2]) / length if length > 1e-9 and tilt > 1e-9 else (1.0, 0.0)
@@ -68,17 +63,16 @@ def folded(data: Measurements) -> np.ndarray:
 
 def kernel(one: np.ndarray, other: np.ndarray, at: Correlation) -> np.ndarray:
     """Of relative errors between places."""
-    tilt = matern(np.abs(one[:, None, 0] - other[None, :, 0]), float(at.length_half))
-    apart = np.linalg.norm(one[:, None, 1:3] - other[None, :, 1:3], axis=-1)
-    alike = tilt * matern(apart, float(at.length_difference)) * (one[:, None, 3] == other[None, :, 3])
+    tilt = matern(np.abs(one[:, None, 0] - other[:, 0]), float(at.length_half))
+    apart = np.linalg.norm(one[:, None, 1:3] - other[:, 1:3], axis=-1)
+    alike = tilt * matern(apart, float(at.length_difference)) * (one[:, None, 3] == other[:, 3])
     return float(at.amplitude) ** 2 * alike * np.outer(larger(one, at), larger(other, at))
 
 
 def larger(where: np.ndarray, at: Correlation) -> np.ndarray:
     """Than along the normal, by the angles of half vector and difference, neither above 85 degrees."""
-    angles = np.abs(where[:, 0]), np.linalg.norm(where[:, 1:3], axis=-1)
-    cosines = np.prod([np.cos(np.radians(np.minimum(angle, 85.0))) for angle in angles], axis=0)
-    return (1.0 / cosines) ** float(at.grazing_exponent)
+    angles = np.minimum([np.abs(where[:, 0]), np.linalg.norm(where[:, 1:3], axis=-1)], 85.0)
+    return np.prod(np.cos(np.radians(angles)), axis=0) ** -float(at.grazing_exponent)
 
 
 def soft(of: Problem) -> np.ndarray:
@@ -106,18 +100,15 @@ def logarithms(of: Problem) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.mark.parametrize("channels", [1, pytest.param(3, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_likelihoods_of_all_and_of_each_given_the_others_are_those_of_the_dense_matrix(
-    layout: str, channels: int
-) -> None:
+def test_likelihoods_of_all_and_leave_one_out_are_those_of_the_dense_matrix(layout: str, channels: int) -> None:
     """So few measurements are all inducing points."""
     of = problem(layout, channels)
     where, slopes = logarithms(of)
-    for vector in (of.start, 0.5 * (of.low + of.high)):
+    for vector in (0.5 * (of.low + of.high), of.start):
         mean, covariance = dense(of, vector)
         expected = stats.multivariate_normal(mean, covariance).logpdf(where) + np.sum(slopes)
         # the kernels' jitter is 1e-8 of variances up to 1e3 times those of the noise
         assert float(of.log_likelihood(vector)) == pytest.approx(expected, abs=1e-3)
-    mean, covariance = dense(of, of.start)
     precision = np.linalg.inv(covariance)
     width = 1.0 / np.sqrt(np.diagonal(precision))
     expected = stats.norm.logpdf(precision @ (where - mean) * width) - np.log(width) + slopes
@@ -142,14 +133,13 @@ def test_many_measurements_are_regressed_on_inducing_points() -> None:
     def both(at: Correlation) -> tuple[np.ndarray, np.ndarray]:
         return kernel(where, where, at), np.asarray(process.weights @ kernel(nodes, nodes, at) @ process.weights.T)
 
-    exact, found = both(Correlation(1.0, *(2.0 * np.asarray(process.shortest)), 0.0, 0.0))
     # what regression leaves is a covariance: nowhere larger than the largest variance, 2 % at a reach half as far
+    exact, found = both(Correlation(1.0, *(2.0 * np.asarray(process.shortest)), 0.0, 0.0))
     assert np.max(np.abs(exact - found)) < 0.02
     for at in (Correlation(0.05, 18.0, 18.0, 0.5, 0.0), Correlation(0.1, 25.0, 25.0, 0.5, 0.0)):
         exact, found = (matrix + 0.02**2 * np.eye(len(where)) for matrix in both(at))
-        levels = [np.linalg.slogdet(matrix)[1] for matrix in (found, exact)]
-        divergence = 0.5 * (np.trace(np.linalg.solve(found, exact)) - len(exact) + levels[0] - levels[1])
-        assert abs(divergence) < 0.5
+        ratio = np.linalg.solve(found, exact)
+        assert abs(0.5 * (np.trace(ratio) - len(exact) - np.linalg.slogdet(ratio)[1])) < 0.5
 
 
 def test_errors_elsewhere_are_those_of_regression() -> None:
@@ -168,10 +158,10 @@ def test_errors_elsewhere_are_those_of_regression() -> None:
 def test_half_squares_are_minus_the_log_posterior() -> None:
     of = problem("two planes", 2)
     vectors = np.random.default_rng(1).uniform(of.low, of.high, (5, len(of.start)))
-    halves = [0.5 * float(np.sum(np.square(of.residuals(vector)))) for vector in vectors]
-    box = of.model.box
-    priors = [0.5 * float(np.sum(box.prior_residuals(jnp.asarray(vector)) ** 2)) for vector in vectors]
-    sums = np.array(halves) + [float(of.log_likelihood(vector)) for vector in vectors] - priors
+    sums = []
+    for vector in vectors:
+        prior = np.sum(of.model.box.prior_residuals(jnp.asarray(vector)) ** 2)
+        sums.append(0.5 * (np.sum(np.square(of.residuals(vector))) - prior) + of.log_likelihood(vector))
     np.testing.assert_allclose(sums, sums[0], rtol=1e-10)
 
 
@@ -182,9 +172,9 @@ def test_information_is_that_of_the_covariance() -> None:
     _, covariance = dense(of, of.start)
     moved = []
     for step in 1e-4 * np.diag(of.start)[first:]:
-        ends = [dense(of, of.start + sign * step)[1] for sign in (1.0, -1.0)]
-        moved.append(np.linalg.solve(covariance, (ends[0] - ends[1]) / (2.0 * step.sum())))
-    expected = 0.5 * np.array([[np.sum(one * other.T) for other in moved] for one in moved])
+        change = dense(of, of.start + step)[1] - dense(of, of.start - step)[1]
+        moved.append(np.linalg.solve(covariance, change / (2.0 * step.sum())))
+    expected = 0.5 * np.einsum("aij,bji->ab", moved, moved)
     rows = np.asarray(of.call(lambda model, v: jax.jacfwd(lambda w: model.linear_parts(w)[1][1])(v), of.start))
     found = (rows.T @ rows)[first:, first:]
     scale = np.sqrt(np.diagonal(expected))
@@ -201,8 +191,7 @@ def test_derivatives_at_the_ends(end: str, relative: float | Free) -> None:
         slope = np.asarray(of.call(lambda model, v, d=derivative: d(model.log_likelihood)(v), vector))
         for found, step in zip(slope, inward, strict=True):
             low, middle, high = (float(of.log_likelihood(vector + count * step)) for count in range(3))
-            expected = (4.0 * middle - 3.0 * low - high) / (2.0 * step.sum())
-            assert found == pytest.approx(expected, rel=1e-4, abs=1e-3)
+            assert found == pytest.approx((4.0 * middle - 3.0 * low - high) / (2.0 * step.sum()), rel=1e-4, abs=1e-3)
 
 
 def test_what_is_given_is_no_parameter() -> None:
@@ -211,42 +200,26 @@ def test_what_is_given_is_no_parameter() -> None:
     assert problem("two planes", 3).names[1:] == every
     free = Free(20.0, 10.0, 50.0)
     fixed = problem("two planes", amplitude=0.1, length_half=20.0, length_difference=free, grazing_exponent=0.0)
-    assert fixed.names == ("['a']", "noise.discrepancy.length_difference")
-    assert fixed.units["noise.discrepancy.length_difference"] == "deg"
+    assert fixed.units == {"['a']": "1", "noise.discrepancy.length_difference": "deg"}
     own = problem("one scan", amplitude=Free(0.05, 0.01, 0.2, LogNormal(0.05, 0.3)))
     assert (own.low[1], own.high[1]) == (0.01, 0.2)
 
 
-@pytest.mark.parametrize(
-    ("call", "message"),
-    [
-        (lambda: Noise(tails="student", discrepancy=True), "Noise.tails is 'student'; with model discrepancy it must"),
-        (lambda: Noise(discrepancy=0.3), "Noise.discrepancy is 0.3; it must be true, false or Discrepancy"),
-        (lambda: Discrepancy(amplitude=-0.1), r"discrepancy.amplitude is -0.1; it must be a number in \[1e-06, 1\]"),
-    ],
-)
-def test_refused(call, message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        call()
-
-
 def test_a_smooth_process_has_a_root_in_single_precision() -> None:
     """Without room for its rounding on the diagonal the root was NaN, and with it every prediction."""
-    process = make_process(MANY.wi, MANY.wo)
+    process, drawn = make_process(MANY.wi, MANY.wo), []
     parts = process, np.random.default_rng(0).standard_normal((1, len(process.where))), Correlation(0.1, 40, 40, 1, 0)
-    found, rough = (
-        one.sample(white, at)
-        for one, white, at in (
-            jax.tree.map(lambda x, kind=kind: jnp.asarray(x, kind), parts) for kind in (jnp.float64, jnp.float32)
-        )
-    )
+    for kind in (jnp.float64, jnp.float32):
+        one, white, at = jax.tree.map(lambda x, kind=kind: jnp.asarray(x, kind), parts)
+        drawn.append(one.sample(white, at))
+    found, rough = drawn
     np.testing.assert_allclose(rough, found, atol=1e-2 * float(jnp.max(jnp.abs(found))))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("double", [False, True])
 def test_channels_that_share_all_errors_have_finite_densities(double: bool) -> None:
-    """At a correlation of 1, with noise far below the discrepancy, the covariance was no longer positive definite."""
+    """At a correlation of 1, with noise far below the discrepancy, the covariance was not positive definite."""
     misfit, relative = np.full((len(MANY.wi), 3), 0.1), np.full((len(MANY.wi), 3), 1e6)
     with jax.enable_x64(double):
         process = make_process(MANY.wi, MANY.wo, 3)

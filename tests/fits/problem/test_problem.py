@@ -1,4 +1,5 @@
-"""Problems as they are put together: the likelihood against scipy.stats, its least-squares form, what is refused."""
+"""Problems as they are put together: the likelihood against scipy.stats, its least-squares form, what is refused; and
+simulated data: the right values, with noise of the size that is stated."""
 
 from dataclasses import dataclass, replace
 from functools import partial
@@ -11,7 +12,8 @@ import pytest
 from scipy import integrate, stats
 
 import layerjax as lj
-from fits import Free, LogNormal, LogUniform, Noise, Normal, Problem, simulate, slices
+from fits import Discrepancy, Free, Instrument, LogNormal, LogUniform, Noise, Normal, Problem, simulate, slices
+from fits.optimise.options import options_from
 from fits.problem.model import Model
 from fits.problem.noise import information_weights, log_density, named_residual, tail_residual
 from tests.helpers.models import design, line, measured
@@ -41,18 +43,15 @@ def test_densities_are_scipys_and_half_squares_of_residuals(z: float) -> None:
 def test_information_is_the_mean_square_score(tails: str) -> None:
     reference, step = TAILS[tails], 1e-5
 
-    def mean(z: float) -> float:
+    def mean(z: np.ndarray) -> np.ndarray:
         return (reference.logpdf(z - step) - reference.logpdf(z + step)) / (2 * step)
 
-    def level(z: float) -> float:
+    def level(z: np.ndarray) -> np.ndarray:
         ends = [reference.logpdf(z * np.exp(-t)) - t for t in (step, -step)]
         return (ends[0] - ends[1]) / (2 * step)
 
-    expected = [
-        2
-        * integrate.quad(lambda z, score=score: reference.pdf(z) * score(z) ** 2, 0, 400, points=[1, 10], limit=200)[0]
-        for score in (mean, level)
-    ]
+    z = np.concatenate([np.linspace(0.0, 10.0, 4001), np.geomspace(10.0, 400.0, 4001)[1:]])
+    expected = [2.0 * integrate.simpson(reference.pdf(z) * score(z) ** 2, z) for score in (mean, level)]
     np.testing.assert_allclose(information_weights(tails, NU), expected, rtol=1e-4)
 
 
@@ -65,18 +64,16 @@ NOISES = {
 }
 
 
-@pytest.mark.parametrize("name", NOISES)
-def test_problem_against_a_likelihood_written_out(name: str) -> None:
+@pytest.mark.parametrize("noise", NOISES.values(), ids=NOISES)
+def test_problem_against_a_likelihood_written_out(noise: Noise) -> None:
     """Log-likelihood and log-prior by scipy; the residuals give their sum up to one constant."""
-    noise = NOISES[name]
     problem = Problem(STACK, measured(VALUES, SIGMA), line, noise, Free(1.0, 0.5, 2.0, LogNormal(1.0, 0.1)))
     assert problem.names[:3] == ("['a']", "['b']", "scale")
     offsets = []
     for vector in np.random.default_rng(1).uniform(problem.low, problem.high, (4, len(problem.names))):
         named = dict(zip(problem.names, vector, strict=True))
-        predicted = named["scale"] * (design(COUNT) @ [named["['a']"], named["['b']"]])[:, None]
-        relative = named.get("noise.relative", noise.relative if isinstance(noise.relative, float) else 0.0)
-        floor = named.get("noise.floor", noise.floor if isinstance(noise.floor, float) else 0.0)
+        predicted = named["scale"] * (design(COUNT) @ vector[:2])[:, None]
+        relative, floor = (named.get(f"noise.{name}", getattr(noise, name) or 0.0) for name in ("relative", "floor"))
         sigma = np.sqrt((SIGMA**2 if noise.use_sigma else 0.0) + (relative * predicted) ** 2 + floor**2)
         law = stats.norm if noise.tails == "gaussian" else stats.t(3.0)
         each = law.logpdf((VALUES - predicted) / sigma) - np.log(sigma)
@@ -109,9 +106,8 @@ def test_masked_samples_never_enter_and_noise_is_five_per_cent_by_default() -> N
     assert clean.count == COUNT - COUNT // 4
     np.testing.assert_array_equal(clean.residuals(vector), masked.residuals(vector))
     predicted = (design(COUNT) @ vector)[:, None]
-    sigma = np.hypot(0.05 * predicted, 1e-4 * np.median(np.abs(VALUES)))
-    problem = Problem(STACK, measured(VALUES), line)
-    assert float(problem.log_likelihood(vector)) == pytest.approx(stats.norm.logpdf(VALUES, predicted, sigma).sum())
+    expected = stats.norm.logpdf(VALUES, predicted, np.hypot(0.05 * predicted, 1e-4 * np.median(np.abs(VALUES))))
+    assert float(Problem(STACK, measured(VALUES), line).log_likelihood(vector)) == pytest.approx(expected.sum())
 
 
 def test_named_residuals() -> None:
@@ -139,9 +135,7 @@ class Plain:
 
 class Module(eqx.Module):
     gain: jax.Array
-
-    def __call__(self, stack: lj.Stack, wi: jax.Array, wo: jax.Array) -> jax.Array:
-        return lambert(stack, wi, wo, self.gain)
+    __call__ = Plain.__call__
 
 
 CALLABLES = {
@@ -158,7 +152,7 @@ CALLABLES = {
 def test_any_callable_stands_for_a_transport(transport, gain: float) -> None:
     problem = Problem(PAINT, DATA, transport=transport)
     np.testing.assert_allclose(problem.predict([0.3]), np.full((3, 1), gain * 0.3 / np.pi), rtol=1e-12)
-    seen = simulate(lj.Stack([], lj.Lambertian(0.3)), slices(incidence=[20], outgoing=[10]), transport=transport)
+    seen = simulate(lj.Stack([], lj.Lambertian(0.3)), slices([20], [10]), transport=transport)
     np.testing.assert_allclose(seen.values, [[gain * 0.3 / np.pi]], rtol=1e-12)
 
 
@@ -168,16 +162,51 @@ def test_what_follows_from_a_problem() -> None:
     assert (problem.count, problem.units) == (3, {"base.albedo": "1", "scale": "1"})
     np.testing.assert_array_equal([problem.low, problem.start, problem.high], [[0.0, 0.5], [0.4, 1.0], [1.0, 2.0]])
     assert problem.model is problem.model
-    colours = lj.Stack([], base=lj.Lambertian(albedo=Free([0.1, 0.2, 0.3], 0.0, 1.0)))
+    colours = lj.Stack([], base=lj.Lambertian(Free([0.1, 0.2, 0.3], 0.0, 1.0)))
     three = Problem(colours, measured(np.repeat(VALUES, 3, axis=1)))
     np.testing.assert_allclose(three.predict([0.1, 0.2, 0.3])[0], np.array([0.1, 0.2, 0.3]) / np.pi, rtol=1e-12)
+
+
+ALBEDO = np.array([0.2, 0.4, 0.6])
+COLOURS = lj.Stack([], lj.Lambertian(ALBEDO))
+
+
+def test_simulated_values_and_noise_are_as_stated():
+    plain = simulate(COLOURS, slices(incidence=[20, 60]))
+    np.testing.assert_allclose(plain.values, np.broadcast_to(ALBEDO / np.pi, plain.values.shape), rtol=1e-12)
+    assert plain.sigma is None
+    assert plain.mask.all()
+    assert plain.channels == ("red", "green", "blue")
+    data = simulate(COLOURS, slices(outgoing=np.linspace(-80, 80, 400)), noise=0.05, floor=0.01, seed=3)
+    expected = np.sqrt((0.05 * ALBEDO / np.pi) ** 2 + 0.01**2)
+    np.testing.assert_allclose(data.sigma, np.broadcast_to(expected, data.sigma.shape))
+    z = (data.values - ALBEDO / np.pi) / data.sigma
+    assert stats.kstest(z.ravel(), "norm").pvalue > 1e-3  # a fixed seed: passes or fails for good
+
+
+def test_seeds_repeat_and_samples_without_light_are_masked():
+    first, again, other = (simulate(COLOURS, slices(), noise=0.1, seed=seed).values for seed in (1, 1, 2))
+    np.testing.assert_array_equal(first, again)
+    assert (first != other).all()
+    data = simulate(COLOURS, slices(incidence=[30], outgoing=[10, 120]), noise=0.05)
+    np.testing.assert_array_equal(data.mask, [True, False])  # nothing passes an opaque base
 
 
 WALK = lj.Stack([], lj.Lambertian(Free((0.4, 0.4), 0.0, 1.0, random_walk_sd=0.1)))
 TWO = replace(DATA, values=np.repeat(DATA.values, 2, axis=1), sigma=None, channels=("a", "b"))
 MANY = np.array([0.1, 0.2, 0.3])
+BARE = lj.Stack([], lj.Lambertian(0.5))
+MIXED = lj.Mixture(dict.fromkeys("abc", BARE), [Free(0.2, 0.0, 0.7), Free(0.2, 0.0, 0.5), None])
 FLAT = {"a": Free(0.3, 0.01, 2.0), "b": 0.1}
-LINE_DATA = measured(VALUES)
+LINE_DATA, DARK = measured(VALUES), measured(1e-300 * np.ones_like(VALUES))
+
+
+def named(noise: Noise) -> Problem:
+    return Problem(FLAT, LINE_DATA, line, noise, objective="cube_root")
+
+
+def rough(roughness: Free | np.ndarray) -> lj.Stack:
+    return lj.Stack([], lj.OrenNayar(0.4, roughness))
 
 
 @pytest.mark.parametrize(
@@ -186,37 +215,40 @@ LINE_DATA = measured(VALUES)
         (lambda: Noise(floor=Free(0.1, 0.0, 1.0)), r"Noise.floor.low is 0.0; it must be a number in \[1e-100, "),
         (lambda: Noise(relative=Free([0.1, 0.1], 0.0, 1.0)), "Noise.relative has 2 channels"),
         (lambda: Noise(floor=1e-200), r"Noise.floor is 1e-200; it must be a number in \[1e-100, 1e\+100\]"),
-        (lambda: Noise(relative=Free(0.5, 0.0, 5.0)), r"Noise.relative.high is 5.0; it must be a number in \[0, 1\]"),
         (lambda: Noise(tails="cauchy"), "Noise.tails: 'cauchy' is not one of 'gaussian', 'student'"),
+        (lambda: Noise(tails="student", discrepancy=True), "Noise.tails is 'student'; with model discrepancy it must"),
+        (lambda: Noise(discrepancy=0.3), "Noise.discrepancy is 0.3; it must be true, false or Discrepancy"),
+        (lambda: Discrepancy(amplitude=-0.1), r"discrepancy.amplitude is -0.1; it must be a number in \[1e-06, 1\]"),
+        (lambda: Instrument(source_aperture=Free(1.0, 0.0, 2.0)), r"source_aperture is Free.* in \[0, 30\]"),
+        (lambda: Instrument(tilt=Free(0.0, -20.0, 5.0)), r"tilt.low is -20.0; it must be a number in \[-10, 10\]"),
+        (lambda: Instrument(gain_sd=True), "Instrument.gain_sd is True"),
+        (lambda: options_from({"tolerance": 1.0}), r"\[options\] has an unknown key 'tolerance'; allowed: same_v"),
+        (
+            lambda: Problem(STACK, LINE_DATA, line, Noise(floor=1e-4), instrument=Instrument(floor=1e-3)),
+            r"Noise.floor and Instrument.floor are both given",
+        ),
+        (lambda: Problem(MIXED, DATA), r"Mixture.weights: at their upper bounds they sum to 1.2; it must be at most"),
+        (lambda: Problem(PAINT, DATA, lj.RandomWalk()), "RandomWalk is random; use a deterministic one"),
+        (lambda: simulate(PAINT, slices(), lj.RandomWalk()), "RandomWalk is random"),
+        (lambda: simulate(PAINT, slices(), noise=5), r"noise is 5; it must be a number in \[0, "),
+        (lambda: Problem(PAINT, DATA, lj.AddingDoubling(tolerance=0.01)), "0.01 needs concrete parameters"),
         (lambda: Problem({"a": 0.1, "b": 0.2}, LINE_DATA, line), "nothing is free"),
         (lambda: Problem(STACK, measured(VALUES, mask=np.zeros(COUNT, bool)), line), "no sample is used"),
         (lambda: Problem(STACK, LINE_DATA, line, Noise(relative=0.0, floor=0.0)), "sigma could become 0"),
-        (
-            lambda: Problem(STACK, measured(1e-300 * np.ones_like(VALUES)), line),
-            r"^values: the median of \|value\| is 1e-300 1/sr; .* must be in \[1e-96, 1e\+30\], or Noise.floor",
-        ),
+        (lambda: Problem(STACK, DARK, line), r"median of \|value\| is 1e-300 1/sr; .* in \[1e-96, 1e\+30\], or Noise"),
         (lambda: Problem(STACK, LINE_DATA, line, scale=-1.0), "scale is -1.0"),
         (lambda: Problem(STACK, LINE_DATA, line, objective="l1"), "objective: 'l1' is not one of 'likelihood', "),
-        (
-            lambda: Problem(STACK, LINE_DATA, line, objective="cube_root"),
-            r"the prior of \['b'\]: objective 'cube_root'",
-        ),
+        (lambda: Problem(STACK, LINE_DATA, line, objective="cube_root"), r"prior of \['b'\]: objective 'cube_root'"),
         (lambda: Problem(WALK, TWO, objective="cosine_l2"), "the prior of base.albedo: objective 'cosine_l2' weighs"),
-        (
-            lambda: Problem(FLAT, LINE_DATA, line, Noise(relative=Free(0.1, 0.0, 1.0)), objective="cosine_l2"),
-            r"noise\.relative: objective 'cosine_l2' weighs neither",
-        ),
-        (
-            lambda: Problem(FLAT, LINE_DATA, line, Noise(discrepancy=True), objective="cube_root"),
-            r"noise\.discrepancy: objective 'cube_root' weighs neither",
-        ),
+        (lambda: named(Noise(relative=Free(0.1, 0.0, 1.0))), r"noise\.relative: objective 'cube_root' weighs neither"),
+        (lambda: named(Noise(discrepancy=True)), r"noise\.discrepancy: objective 'cube_root' weighs neither"),
         (lambda: Problem(WALK, replace(TWO, values=TWO.values[:, :1], channels=("a",))), "it has 2 channels, the data"),
         (lambda: Problem(PAINT, DATA, transport="walk"), r'transport: .* is not a Transport or "auto"'),
         (
-            lambda: Problem(lj.Stack([], lj.OrenNayar(0.4, Free(MANY, 0.0, 1.0))), DATA, lj.SingleScattering()),
-            r"takes one stack; base.roughness of shape \(3,\) makes it a map",
+            lambda: Problem(rough(Free(MANY, 0.0, 1.0)), DATA),
+            r"takes one stack; base.roughness of shape \(3,\) makes it",
         ),
-        (lambda: simulate(lj.Stack([], lj.OrenNayar(0.4, MANY)), slices()), r"base.roughness of shape \(3,\)"),
+        (lambda: simulate(rough(MANY), slices()), r"base.roughness of shape \(3,\)"),
     ],
 )
 def test_refused(call, message: str) -> None:

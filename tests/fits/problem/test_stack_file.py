@@ -18,6 +18,9 @@ FULL = """
 about = { source = "a paper", remark = "kept as it is" }
 transport = { kind = "AddingDoubling", nodes = 16, ordinates = [8, 12], tolerance = 0.01 }
 objective = "cube_root"
+scale = { start = 1.0, low = 0.8, high = 1.25, prior = { kind = "LogNormal", median = 1.0, sd = 0.05 } }
+instrument = { detector_aperture = 2.0, tilt = { start = 0.0, low = -1.0, high = 1.0 } }
+options = { autocorrelation = 0.4 }
 [[layers]]
 kind = "Medium"
 thickness = { start = 0.5, low = 0.0, high = 5.0 }
@@ -39,33 +42,24 @@ relative = { start = 0.05, low = 0.01, high = 0.5 }
 floor = 1e-4
 use_sigma = false
 discrepancy = { length_half = { start = 12.0, low = 8.0, high = 20.0 } }
-[scale]
-start = 1.0
-low = 0.8
-high = 1.25
-prior = { kind = "LogNormal", median = 1.0, sd = 0.05 }
-[instrument]
-detector_aperture = 2.0
-tilt = { start = 0.0, low = -1.0, high = 1.0 }
-[options]
-autocorrelation = 0.4
 """
 INSTRUMENT = Instrument(detector_aperture=2.0, tilt=Free(0.0, -1.0, 1.0))
 BASE = 'base = { kind = "Lambertian", albedo = 0.5 }\n'
 LAYER = "[[layers]]\nkind = 'Medium'\n"
+THIN = LAYER + "thickness = 1\n"
 
 
-def read(tmp_path: Path, text: str):
+def read(tmp_path: Path, text: str | bytes):
     path = tmp_path / "problem.toml"
-    path.write_text(text)
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
     return read_problem(path)
 
 
 def assert_same(first: lj.Stack, second: lj.Stack) -> None:
-    leaves, others = (jax.tree.leaves(stack, is_leaf=is_free) for stack in (first, second))
-    assert jax.tree.structure(first, is_leaf=is_free) == jax.tree.structure(second, is_leaf=is_free)
-    for leaf, other in zip(leaves, others, strict=True):
-        assert leaf == other if is_free(leaf) else np.array_equal(leaf, other)
+    def same(leaf, other):
+        return leaf == other if is_free(leaf) else np.array_equal(leaf, other)
+
+    assert all(jax.tree.leaves(jax.tree.map(same, first, second, is_leaf=is_free)))
 
 
 def test_everything_in_a_file_arrives_and_is_written_again(tmp_path):
@@ -135,28 +129,25 @@ def test_dictionary_round_trip():
 FREE = LAYER + "thickness = {{ start = 1, low = 0, high = 2{} }}\n"
 WRONG = {
     "": "neither a layer nor a base",
-    LAYER + "thickness = 1\nalbdo = 0.5\n": r"layers\[0\] has an unknown key 'albdo' \(did you mean 'albedo'\?\); allo",
+    b"\xef\xbb\xbf": "neither a layer nor a base",
+    BASE.encode("utf-16"): r"not a text file \(byte 0 is not UTF-8\)",
+    "base." + "a." * 2000 + "b = 1\n": "base has no kind",
+    "about = { day = 2020-13-01 }\n": "not valid TOML: ",
+    THIN + "albdo = 0.5\n": r"layers\[0\] has an unknown key 'albdo' \(did you mean 'albedo'\?\); allo",
     BASE + "bse = 3\n": "the file has an unknown key 'bse'",
     LAYER + "thickness = -1\n": r"layers\[0\]: Medium.thickness: -1 is outside \[0, 10000\]",
     LAYER + "albedo = 0.5\n": r"layers\[0\] has no thickness, which Medium needs",
     "[[layers]]\nthickness = 1\n": r"layers\[0\] has no kind, must be one of Interface, Medium",
     "[[layers]]\nkind = 'Mediun'\n": r"layers\[0\].kind is 'Mediun' \(did you mean 'Medium'\?\)",
-    FREE.format(", hihg = 2"): r"layers\[0\].thickness has an unknown key 'hihg'",
     FREE.replace("low = 0", "low = 5").format(""): r"layers\[0\].thickness: low is 5.0 and high is 2.0",
-    FREE.replace(", high = 2", "").format(""): r"layers\[0\].thickness has no high, which Free needs",
     FREE.replace("high = 2", "high = 1e6").format(""): r"layers\[0\].thickness.high is 1000000.0, must be a number in",
     FREE.format(", prior = { kind = 'Normal', mean = 1, sd = -1 }"): r"layers\[0\].thickness.prior: Normal.sd is -1",
-    LAYER
-    + "thickness = 1\nphase = { kind = 'SGGX', shape = 'ball', alpha = 0.1 }\n": r"layers\[0\].phase: SGGX.shape: ",
+    THIN + "phase = { kind = 'SGGX', shape = 'ball', alpha = 0.1 }\n": r"layers\[0\].phase: SGGX.shape: ",
     BASE + "noise = { discrepancy = { length_half = -3.0 } }\n": "noise.discrepancy.length_half is -3.0",
     BASE + "scale = { start = [1, 1], low = 0.5, high = 2 }\n": "scale has 2 channels, must be one number for all",
     BASE + "instrument = { detector_aperture = 31 }\n": r"instrument.detector_aperture is 31; .* in \[0, 30\]",
-    BASE
-    + "instrument = { floor = { start = 1, low = 0, high = 2 } }\n": "instrument.floor.low is 0.0; .* in .1e-100, ",
     BASE + "transport = 'Singlescattering'\n": "transport is 'Singlescattering' .did you mean 'SingleScattering'",
-    "[base]\nkind = 'Lambertian'\nalbedo = [0.1, 0.2]\n"
-    + LAYER
-    + "thickness = [1, 2, 3]\n": "disagree on the number of",
+    BASE.replace("0.5", "[0.1, 0.2]") + LAYER + "thickness = [1, 2, 3]\n": "disagree on the number of",
 }
 
 
@@ -166,23 +157,6 @@ def test_bad_files_are_one_line_that_names_the_place(tmp_path, text):
         read(tmp_path, text)
     assert str(caught.value).startswith(str(tmp_path / "problem.toml"))
     assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize(
-    ("content", "words"),
-    [
-        (b"\xef\xbb\xbf", "there is neither a layer nor a base"),
-        (BASE.encode("utf-16"), "not a text file (byte 0 is not UTF-8)"),
-        (b"base." + b"a." * 2000 + b"b = 1\n", "base has no kind"),
-        (b"about = { day = 2020-13-01 }\n", "not valid TOML: "),
-    ],
-)
-def test_files_that_hold_something_else(tmp_path: Path, content: bytes, words: str) -> None:
-    path = tmp_path / "stack.toml"
-    path.write_bytes(content)
-    with pytest.raises(ValueError) as caught:  # noqa: PT011 (parentheses in what is looked for)
-        read_problem(path)
-    assert words in str(caught.value)
     with pytest.raises(ValueError, match="is a directory, must be a file"):
         read_problem(tmp_path)
 
@@ -194,8 +168,6 @@ def test_examples_are_valid(path):
     assert any(map(is_free, jax.tree.leaves(problem.stack, is_leaf=is_free)))
 
 
-# ---- any value in any place ----
-
 MEDIUM = 'layers = [{ kind = "Medium", thickness = 1.0, %s }]\n'
 NUMBER = 'layers = [{ kind = "Medium", thickness = { start = 1.0, low = 0.5, high = 2.0%s } }]\n'
 # where @ stands, any value may be written; the keys are what an error must name
@@ -205,7 +177,6 @@ PLACES = {
     "layers[0].thickness": 'layers = [{ kind = "Medium", thickness = @ }]\n',
     "layers[0].phase": MEDIUM % "phase = @",
     "layers[0].phase.shape": MEDIUM % 'phase = { kind = "SGGX", shape = @, alpha = 0.5 }',
-    "layers[0].distribution": 'layers = [{ kind = "Interface", ior = 1.5, alpha = 0.1, distribution = @ }]\n',
     "layers[0].thickness.low": NUMBER.replace("0.5", "@") % "",
     "layers[0].thickness.prior": NUMBER % ", prior = @",
     "layers[0].thickness.prior.median": NUMBER % ', prior = { kind = "LogNormal", median = @, sd = 0.1 }',
@@ -216,21 +187,13 @@ PLACES = {
     "noise": BASE + "noise = @\n",
     "noise.relative": BASE + "noise = { relative = @ }\n",
     "noise.use_sigma": BASE + "noise = { use_sigma = @ }\n",
-    "scale.low": BASE + "scale = { start = 1.0, low = @, high = 2.0 }\n",
     "mystery": BASE + "mystery = @\n",
 }
-VALUES = {
+TOKENS = ("inf", "nan", "-1e308", "1e-310", "true", "2020-02-29T12:00:00.123456Z", "[]", "[[0.5]]")
+VALUES = {token: token for token in TOKENS} | {
     "309 digits": "9" * 309,
-    "infinity": "inf",
-    "not a number": "nan",
-    "-1e308": "-1e308",
-    "1e-310": "1e-310",
-    "true": "true",
-    "moment": "2020-02-29T12:00:00.123456Z",
     "long text": '"' + "long " * 20_000 + '"',
     "lines": r'"first\nsecond\u0000third"',
-    "empty list": "[]",
-    "list of lists": "[[0.5]]",
     "long list of texts": "[" + "'half', " * 2000 + "]",
     "arrays 20000 deep": "[" * 20_000 + "]" * 20_000,
     "tables 300 deep": "{ a = " * 300 + "1" + " }" * 300,
@@ -245,11 +208,10 @@ def test_any_value_in_any_place(tmp_path: Path, name: str) -> None:
         try:
             problem = read_problem(path)
         except ValueError as error:
-            message = str(error)
-            assert message.startswith(f"{path}: "), message[:200]
+            named, message = str(error)[: len(f"{path}: ")], str(error)[len(f"{path}: ") :]
+            assert named == f"{path}: ", message[:200]
             assert message.isprintable(), message
-            assert len(message) < len(str(path)) + 700, message
-            message = message.removeprefix(f"{path}: ")
+            assert len(message) < 700, message
             unread = message.startswith(("arrays or tables are nested", "not valid TOML"))
             assert unread == ("20000 deep" in name), message
             first, last = place.split(".")[0].split("[")[0], place.split(".")[-1].split("[")[0]
@@ -257,8 +219,8 @@ def test_any_value_in_any_place(tmp_path: Path, name: str) -> None:
             continue
         parts = (problem.stack, problem.scale, problem.noise.relative, problem.noise.floor)
         box = Box.of([leaf for leaf in jax.tree.leaves(parts, is_leaf=is_free) if is_free(leaf)])
-        for s in np.linspace(0.0, 1.0, 5)[:, None] * np.ones(len(box.low)):
-            vector = box.from_unit(s)
+        for share in np.linspace(0.0, 1.0, 5):
+            vector = box.from_unit(np.full(len(box.low), share))
             for found in (vector, box.prior_residuals(vector) ** 2, box.log_prior(np.clip(vector, box.low, box.high))):
                 assert np.isfinite(found).all()
         given = {name: getattr(problem, name) for name in ("transport", "noise", "scale", "objective")}

@@ -19,13 +19,13 @@ from tests.helpers.models import POSITIVE_LINE, SCANS, along, line, wrong_line
 
 TRUTH = np.array([1.0, 0.5, 0.1, 12.0, 12.0, 0.3])  # the line, and the discrepancy: amplitude, lengths, exponent
 NOISE = Noise(relative=0.02, floor=1e-4, discrepancy=True)
-WIDE = Noise(relative=0.2, floor=1e-4, discrepancy=False)
+FIRST, SECOND, WEAKLY = "layers[0].thickness", "base.albedo", "weakly identified: see direction"
+TOGETHER = Direction(0.3, {FIRST: 0.8, SECOND: -0.6}, {FIRST: 0.01, SECOND: 0.02})
 TERM = SimpleNamespace(amplitude=0.05, grazing_exponent=0.5, length_half=18.0, length_difference=11.0)
 
 
 def simulated(seed: int) -> Problem:
-    data = wrong_line(seed, Discrepancy(*TRUTH[2:]))
-    return Problem(POSITIVE_LINE, data, line, NOISE)
+    return Problem(POSITIVE_LINE, wrong_line(seed, Discrepancy(*TRUTH[2:])), line, NOISE)
 
 
 @pytest.fixture(scope="module")
@@ -36,38 +36,19 @@ def fitted() -> Fit:
 def test_no_two_statements_contradict_each_other(coat_fit: Fit) -> None:
     """A report once said that sigma is too large, errors by 2, and that correlation makes errors too small by 4.4."""
     facts = assess(coat_fit)
-    first, second = coat_fit.problem.names
-    direction = Direction(0.3, {first: 0.8, second: -0.6}, {first: 0.01, second: 0.02})
-    words = dict.fromkeys((first, second), "identified")
-    parameters = [
-        {"words": words},
-        {"words": words | {first: f"correlated with {second} +0.97"}},
-        {"words": words | {first: "weakly identified: see direction 1"}, "unidentified": (direction,)},
-        *(
-            {"words": words | {first: one}}
-            for one in ("at a bound", "insensitive: no", "limited by", "prior-dominated:")
-        ),
-    ]
+    parameters = ["identified", f"correlated with {SECOND} +0.97", f"{WEAKLY} 1", "at a bound", "insensitive: no"]
+    parameters += ["limited by", "prior-dominated:"]
     sizes = {-9.0: 0.2, 0.0: 1.0, 9.0: 4.0}  # excess of chi-square, and chi-square
-    table = product((True, False), (True, False), (True, False), (True, False), sizes, (0.0, 0.9), (None, (TERM, 9.0)),
-                    (0, 1, 3), parameters)  # fmt: skip
-    count = 0
+    count, switches = 0, [(True, False)] * 4
+    table = product(*switches, sizes, (0.0, 0.9), (None, (TERM, 9.0)), (0, 1, 3), parameters)
     for converged, likelihood, stated, described, excess, lag, term, others, identified in table:
         if not described and (not likelihood or (term is None and excess <= 0.0)):
             continue  # what is not described has a large chi-square, at least without the discrepancy
         fitted = SimpleNamespace(converged=converged, is_posterior=likelihood, alternatives=range(others))
-        vars(fitted).update(degrees_of_freedom=400, unidentified=identified.get("unidentified", ()))
-        case = replace(
-            facts,
-            fit=fitted,
-            noise_assumed=not stated,
-            described=described,
-            excess=excess,
-            ratio=sizes[excess],
-            lag_one=lag,
-            discrepancy=term,
-            words=identified["words"],
-        )
+        vars(fitted).update(degrees_of_freedom=400, unidentified=(TOGETHER,) * (WEAKLY in identified))
+        size = {"excess": excess, "ratio": sizes[excess], "lag_one": lag}
+        case = replace(facts, fit=fitted, noise_assumed=not stated, described=described, discrepancy=term, **size)
+        case = replace(case, words={FIRST: identified, SECOND: "identified"})
         said = [one for some in verdicts.statements(case).values() for one in some]
         claims: dict[str, str] = {}
         for sentence, own in said:
@@ -89,9 +70,7 @@ def test_one_statement_weighs_size_and_correlation_of_residuals(coat_fit: Fit) -
     factor = np.sqrt(0.19) * np.sqrt(1.9 / 0.1)  # (1 + r) / (1 - r) for the correlation
     words = f"too small by a factor of about {factor:.2g} (0.44 for the size of the whitened residuals times 4.4"
     assert words in verdicts.statements(case)["verdict"][1].sentence
-    far = replace(
-        facts, misfit=(1.04, 3.0)
-    )  # a large deviation is a factor: as a share of the model it is no more than 1
+    far = replace(facts, misfit=(1.04, 3.0))  # a large deviation is a factor: as a share of the model it is at most 1
     assert "within 4 % of the model, 95 % within a factor of 3" in verdicts.statements(far)["verdict"][0].sentence
 
 
@@ -105,13 +84,8 @@ def test_the_verdict_is_three_sentences_and_quotes_the_misfit(coat_fit: Fit) -> 
     assert np.mean(errors < 0.01 * half) == pytest.approx(0.5, abs=0.05)
     assert np.mean(errors < 0.01 * most) == pytest.approx(0.95, abs=0.05)
     other = replace(coat_fit, minima=(replace(coat_fit.minima[0], equivalent=True),))
-    bad = (
-        {"fit": replace(coat_fit, converged=False)},
-        {"fit": other},
-        {"excess": 9.0, "ratio": 9.0},
-        {"resolved": False},
-    )
-    for change in bad:
+    stopped = replace(coat_fit, converged=False)
+    for change in ({"fit": stopped}, {"fit": other}, {"excess": 9.0, "ratio": 9.0}, {"resolved": False}):
         assert not verdicts.verdict(coat_fit, replace(facts, **change)).sound
 
 
@@ -123,8 +97,9 @@ def test_residuals_of_the_assumed_model_are_independent_standard_normal(fitted: 
         residuals.append(standardised(true))
         pairs.append(neighbours(true.problem.data, residuals[-1]))
         assert true.chi_square == pytest.approx(np.sum(residuals[-1] ** 2), rel=1e-6)
-    everything, (first, second) = np.concatenate(residuals), (np.concatenate(part) for part in zip(*pairs, strict=True))
-    assert np.sqrt(np.mean(everything**2)) == pytest.approx(1.0, abs=3.0 / np.sqrt(2.0 * everything.size))
+    first, second = (np.concatenate(part) for part in zip(*pairs, strict=True))
+    size = np.sqrt(np.mean(np.square(residuals)))
+    assert size == pytest.approx(1.0, abs=3.0 / np.sqrt(2.0 * np.size(residuals)))
     assert abs(correlation(first, second)) < 3.0 / np.sqrt(len(first))
     # beside the curve with the discrepancy, which follows the data, residuals are smaller
     assert np.mean(misfit(fitted) ** 2) < np.mean(standardised(fitted) ** 2)
@@ -136,19 +111,18 @@ def test_a_stack_that_misses_is_named_though_the_discrepancy_absorbs_all(fitted:
     found = verdicts.verdict(off)
     assert not found.sound
     words = r"This stack does not describe the sample: median misfit (\d+) %, stated noise ([\d.]+) %\."
-    match = re.match(words, found.sentences[0])
-    assert match is not None
-    assert float(match[1]) == pytest.approx(100.0 * np.median(off.predicted / off.problem.data.values - 1.0), abs=1.0)
-    assert float(match[2]) == pytest.approx(2.0)
-    without = np.sum((np.log(off.problem.data.values / off.predicted) / 0.02) ** 2) / off.degrees_of_freedom
-    match = re.search(r"The reduced chi-square is ([\d.e+]+) with it and ([\d.e+]+) without", found.remarks[0])
-    assert match is not None
-    assert float(match[1]) == pytest.approx(off.reduced_chi_square, rel=0.01)
-    assert float(match[2]) == pytest.approx(without, rel=0.05)
+    median, noise = map(float, re.match(words, found.sentences[0]).groups())
+    assert median == pytest.approx(100.0 * np.median(off.predicted / off.problem.data.values - 1.0), abs=1.0)
+    assert noise == pytest.approx(2.0)
+    alone = np.sum((np.log(off.problem.data.values / off.predicted) / 0.02) ** 2) / off.degrees_of_freedom
+    words = r"The reduced chi-square is ([\d.e+]+) with it and ([\d.e+]+) without"
+    within, without = map(float, re.search(words, found.remarks[0]).groups())
+    assert within == pytest.approx(off.reduced_chi_square, rel=0.01)
+    assert without == pytest.approx(alone, rel=0.05)
     assert not assess(replace(fitted, problem=simulated(0), vector=TRUTH)).described  # 10 % beside a noise of 2 %
-    right = replace(fitted, problem=replace(fitted.problem, noise=WIDE), unidentified=())
-    right = replace(right, vector=TRUTH[:2], errors=fitted.errors[:2], covariance=fitted.covariance[:2, :2])
-    assert assess(right).described
+    true = {"vector": TRUTH[:2], "errors": fitted.errors[:2], "covariance": fitted.covariance[:2, :2]}
+    wide = replace(fitted.problem, noise=Noise(relative=0.2, floor=1e-4, discrepancy=False))
+    assert assess(replace(fitted, problem=wide, unidentified=(), **true)).described
 
 
 def test_both_curves_are_drawn_and_the_residuals_are_those_of_the_one_with_the_discrepancy(fitted: Fit) -> None:
@@ -180,13 +154,11 @@ def test_noise_that_is_assumed_is_announced(coat_fit: Fit) -> None:
         assert tables.noise_in_words(Problem(POSITIVE_LINE, along(SCANS, 1.0, sigma), line, noise)).startswith(said)
 
 
-FIRST, SECOND = "layers[0].thickness", "base.albedo"
-TOGETHER = Direction(0.3, {FIRST: 0.8, SECOND: -0.6}, {FIRST: 0.01, SECOND: 0.02})
 MOSTLY = Direction(0.6, {FIRST: 0.9996, SECOND: 0.028}, {FIRST: 0.01, SECOND: 0.02})
 OTHER = Direction(0.2, {SECOND: 0.9996, FIRST: 0.028}, {FIRST: 0.01, SECOND: 0.02})
 BROAD = Direction(1.5, {FIRST: 0.94, SECOND: 0.34}, {FIRST: 0.01, SECOND: 0.02})
 UNKNOWN = Direction(np.inf, {FIRST: 1.0}, {FIRST: np.inf})
-WEAKLY, SEPARATELY = "weakly identified: see direction", f"{FIRST} and {SECOND} are not identified separately"
+SEPARATELY = f"{FIRST} and {SECOND} are not identified separately"
 
 
 @pytest.mark.parametrize(
@@ -214,8 +186,6 @@ def test_unidentified_directions_and_bounds_are_named(
     assert verdicts.verdict(case).sentences[2].startswith(sentence)
     assert ("no error" in tables.parameter_table(case).note) == bool(at_bound)
     shown = tables.unidentified_table(case).rows
-    assert [row[2] for row in shown] == [
-        "unidentified" if one.unconstrained else "weakly identified" for one in directions
-    ]
+    assert [row[2] == "unidentified" for row in shown] == [one.unconstrained for one in directions]
     if directions[:1] == (TOGETHER,):
         assert shown[0][3:] == (f"+0.8 {FIRST}, -0.6 {SECOND}", f"{FIRST} 0.01, {SECOND} 0.02")
