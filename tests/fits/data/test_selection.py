@@ -62,15 +62,10 @@ TURNED = np.abs(np.sin(np.radians(DATA.phi_o))) > 0.1
         ("incidence=10,50.2", np.abs(DATA.theta_i - 30.0) > 0.1),
         ("theta_o=20:40", (DATA.theta_o > 19.9) & (DATA.theta_o < 40.1)),
         ("azimuth=60", TURNED),
-        ({"incidence": [10, 50.2]}, np.abs(DATA.theta_i - 30.0) > 0.1),
-        ({"azimuth": 60}, TURNED),
         ({"azimuth": -120}, TURNED),
         ({"in_plane": False}, TURNED),
         ({"theta_o": slice(None, 60)}, DATA.theta_o < 60.5),
-        (
-            {"theta_o": slice(20, 60), "incidence": 10, "in_plane": True},
-            (DATA.theta_o > 19.5) & (DATA.theta_o < 60.5) & (DATA.theta_i < 11.0) & ~TURNED,
-        ),
+        ({"incidence": [10, 50], "in_plane": True}, (np.abs(DATA.theta_i - 30.0) > 0.1) & ~TURNED),
     ],
 )
 def test_words_and_arguments_select_and_drop_omits_the_same(given, expected):
