@@ -11,7 +11,6 @@ from fits import MapOptions, Noise, SpatialPrior
 from fits.cli.parser import main
 from fits.maps.store import FLAGS
 from tests.helpers.commands import refused
-from tests.helpers.map_files import ANGLES, MASK, SIGMA, VALUES
 from tests.helpers.painted_maps import numbers, stored, without
 
 WORDS = ["fit-map", "map.npy", "--geometry", "view.csv", "--stack", "coat.toml", "--out", "coat.zarr"]
@@ -30,10 +29,8 @@ def made(path, failing=0, chunks=None):
 @pytest.fixture
 def place(work):
     """A current directory with a map, its directions, and a stack file."""
-    for name, array in (("map", VALUES), ("sigma", SIGMA), ("mask", MASK)):
-        np.save(work / f"{name}.npy", array)
-    table = np.column_stack(list(ANGLES.values()))
-    np.savetxt(work / "view.csv", table, delimiter=",", header=",".join(ANGLES), comments="")
+    np.save(work / "map.npy", np.ones((5, 1)))
+    (work / "view.csv").write_text("theta_i,phi_i,theta_o,phi_o\n10,180,20,0\n")
     return work
 
 
@@ -99,14 +96,11 @@ def test_what_was_found_is_printed_and_a_map_that_did_not_converge_is_doubtful(r
     [
         ("map.npy=nowhere.npy", "nowhere.npy: no such file"),
         ("map.npy=.", "layerjax fit-many"),
-        ("map.npy=data.csv", "data.csv: a map is one array"),
         ("view.csv=coat.toml", "coat.toml, line"),
         ("coat.zarr=coat.h5", "coat.h5: a fitted map can be written as .zarr only"),
-        ("coat.zarr=file.zarr", "file.zarr: is no store of a fitted map"),
         ("--spatial-prior gaussian", "--spatial-prior needs --spatial-scale"),
     ],
 )
 def test_bad_input_is_named(place, capsys, words, message):
-    (place / "file.zarr").write_text("")
     change, more = ({}, words.split()) if words.startswith("--") else (dict([words.split("=")]), [])
     assert message in refused([*(change.get(word, word) for word in WORDS), *more], capsys, place)

@@ -27,9 +27,8 @@ def test_channels_have_names():
     assert [channel_names(count)[-1] for count in (1, 2, 3)] == ["value", "channel2", "blue"]
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
+def test_bad_arrays_are_refused():
+    for change, message in (
         ({"values": np.ones((3, 2))}, r"values has shape \(3, 2\), must be \(3, 1\)"),
         ({"wi": np.ones((2, 3))}, r"wi has shape"),
         ({"wo": 2 * direction([1, 2, 3], 0)}, "wo has length 2, must be 1"),
@@ -38,11 +37,9 @@ def test_channels_have_names():
         ({"sigma": np.zeros((3, 1))}, "sigma is 0 in a sample that is used"),
         ({"values": np.array([[1.0], [-1e300], [1.0]])}, r"values holds 1e\+300, must be at most 1e\+30 in size"),
         ({"sigma": np.full((3, 1), 1e-200)}, "sigma is 1e-200 in a sample that is used, must be > 0, at least 1e-100"),
-    ],
-)
-def test_bad_arrays_are_refused(change, message):
-    with pytest.raises(ValueError, match=message):
-        measurements(**change)
+    ):
+        with pytest.raises(ValueError, match=message):
+            measurements(**change)
 
 
 def test_masks_narrow_and_are_noted():

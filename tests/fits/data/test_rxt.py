@@ -29,19 +29,14 @@ def test_rows_by_a_count(slab):
     np.testing.assert_allclose(found.totals.values, [[0.168, 0.162], [0.249, 0.264]])
 
 
-@pytest.mark.parametrize(
-    ("slides", "ior", "expected"),
-    [
-        (1.5, 1.4, [1.5, 1.4, None, 1.5, 1.0]),
-        (1.0, 1.4, [1.4, None, 1.0]),
-        (1.0, 1.0, [None]),
-        (1.5, 1.5, [1.5, None, 1.0]),
-    ],
-)
-def test_the_stack_is_the_slab(slab, slides, ior, expected):
+STACKS = {(1.5, 1.4): [1.5, 1.4, None, 1.5, 1.0], (1.0, 1.4): [1.4, None, 1.0], (1.5, 1.5): [1.5, None, 1.0]}
+
+
+@pytest.mark.parametrize(("slides", "ior"), STACKS)
+def test_the_stack_is_the_slab(slab, slides, ior):
     text = BARE.replace("1.4 ", f"{ior} ").replace("1.5 ", f"{slides} ")
     stack = slab(f"{text}1\n0.3\n").stack(2.0, 0.1, lj.HenyeyGreenstein(0.8))
-    assert [getattr(layer, "ior", None) for layer in stack.layers] == expected
+    assert [getattr(layer, "ior", None) for layer in stack.layers] == STACKS[slides, ior]
     assert all(layer.alpha == SMOOTH for layer in stack.layers if isinstance(layer, lj.Interface))
     (medium,) = (layer for layer in stack.layers if isinstance(layer, lj.TurbidMedium))
     assert (medium.thickness_mm, medium.mu_s, medium.mu_a) == (2.0, 2.0, 0.1)
@@ -102,18 +97,14 @@ def test_headers_say_which_spheres(slab):
     assert slab(none).totals.spheres == Spheres(front, None, 0.98)
 
 
-@pytest.mark.parametrize(
-    "comment",
-    ["measured by a dual beam spectrometer", "Process this file as 'iad -X -i 8 -g 0.9 filename'", "dual-beam method"],
-)
+@pytest.mark.parametrize("comment", ["a dual beam spectrometer", "as 'iad -X -i 8 -g 0.9 filename'", "dual-beam"])
 def test_two_beams_need_no_sphere(slab, comment):
     """iad's ``-X``, which such a file asks for: what is read is the sample's own."""
     text = f"{ONE}2\n0.3 0.4\n".replace("a slab", comment)
     found = slab(text)
-    assert found.totals.spheres is None
     assert "two beams were compared: spheres are ignored" in found.totals.source.notes[0]
     assert slab(text, corrected=False).totals.spheres is not None
-    assert slab(text, corrected=True).totals.spheres is None
+    assert found.totals.spheres is slab(text, corrected=True).totals.spheres is None
     with pytest.raises(ValueError, match="two beams were compared, and the header that two spheres stand together"):
         slab(text.replace("1      # spheres", "2      # spheres"))
     assert slab(text.replace(comment, "iad -x 8 -g 0.9")).totals.spheres is not None

@@ -3,7 +3,6 @@
 import dataclasses
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -33,13 +32,9 @@ def free(low=-0.2, high=0.8, prior=None):
 
 @pytest.fixture(scope="module")
 def values(geometry):
-    def one(numbers):
-        stack = coat(*numbers, G)
-        return lj.evaluate(stack, jnp.asarray(geometry.wi), jnp.asarray(geometry.wo), transport=TRANSPORT)
-
-    exact = np.asarray(jax.jit(jax.vmap(one))(TRUTH)).reshape(len(TRUTH), -1, 1)
-    sigma = np.hypot(NOISE.relative * exact, NOISE.floor)
-    return exact + sigma * np.random.default_rng(3).standard_normal(exact.shape)
+    exact = [lj.evaluate(coat(*one, G), geometry.wi, geometry.wo, transport=TRANSPORT) for one in TRUTH]
+    sigma = np.hypot(NOISE.relative * np.array(exact), NOISE.floor)
+    return exact + sigma * np.random.default_rng(3).standard_normal(sigma.shape)
 
 
 @pytest.mark.parametrize(
@@ -81,16 +76,14 @@ def test_a_map_holds_what_its_texels_have_in_common(tmp_path, geometry, values):
     shared = map.attributes["common"]["layers[0].phase.g"]
     assert abs(shared["value"] - G) < 4.0 * shared["error"]
     assert (shared["unit"], shared["converged"]) == ("1", True)
-    for column, name in enumerate(NAMES):
-        pulls = (map.values[name] - TRUTH[:, column]) / map.errors[name]
-        assert np.all(np.abs(pulls) < 4.5)
+    for name, truth in zip(NAMES, TRUTH.T, strict=True):
+        assert np.all(np.abs(map.values[name] - truth) < 4.5 * map.errors[name])
     # and a level of noise, of which 64 measurements know 9 %, and 8 of 64 degrees of freedom are fitted away
     stack = coat(fits.Free(0.5, 0.05, 3.0), fits.Free(0.4, 0.0, 1.0), G)
     noise = dataclasses.replace(NOISE, relative=fits.Free(0.05, 0.001, 0.3, same_for_all_texels=True))
     map = fitted(tmp_path / "noise.zarr", stack, noise)
     shared = map.attributes["common"]["noise.relative"]
     assert abs(shared["value"] - 0.02) < 4.0 * shared["error"] + 0.002
-    assert fitted(tmp_path / "noise.zarr", stack, noise).attributes == map.attributes
     with pytest.raises(ValueError, match="all free parameters are common"):
         fitted(tmp_path / "none.zarr", coat(0.5, 0.4, fits.Free(0.2, -0.2, 0.8, same_for_all_texels=True)))
     assert not (tmp_path / "none.zarr").exists()
@@ -114,7 +107,6 @@ def problem_of(stack, noise=None, **more):
 def test_a_stack_file_has_the_mark(tmp_path):
     scale, path = common(1.0, 0.8, 1.25), tmp_path / "coat.toml"
     write_problem(path, COAT, scale=scale)
-    assert path.read_text().count("same_for_all_texels = true") == 3
     again = read_problem(path)
     assert (again.scale, again.stack.layers[0].phase.g) == (scale, HAZE.phase.g)
     path.write_text("[base]\nkind = 'Lambertian'\nalbedo = { start = 0, low = 0, high = 1, same_for_all_texels = 1 }\n")
