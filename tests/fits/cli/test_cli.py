@@ -1,6 +1,5 @@
 """The `layerjax` command at work: every command writes and prints what it should."""
 
-import csv
 import io
 import json
 import os
@@ -8,6 +7,7 @@ import subprocess
 import sys
 import warnings
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -30,29 +30,25 @@ TRUE = {"layers[0].thickness": 0.6, "base.albedo": 0.4}  # of the stack behind c
 def test_fit_writes_a_result(work, capsys, coat_toml, layerjax):
     words = "fit data.csv --stack coat.toml --out result --starts 4"
     output = layerjax(f"{words} --max-polar-angle 80")
-    for word in ("layers[0].thickness", "base.albedo", "chi2/dof", "4 starts", "result/report.html"):
-        assert word in output.out
-    assert "fit 4/4" in output.err
+    for word in (*TRUE, "chi2/dof", "4 starts", "result/report.html", "fit 4/4"):
+        assert word in output.out + output.err
     result = load_fit("result")
     assert result.problem.data.used().theta_o.max() <= 80
     for name, truth in TRUE.items():
         assert abs(result.values[name] - truth) < 4 * result.standard_errors[name]
     assert (work / "result" / "problem.toml").read_text() == coat_toml.read_text()
     stored = json.loads((work / "result" / "fit.json").read_text())
-    assert stored["versions"]["jax"]
-    assert stored["values"] == result.values
-    assert {"starts": 4, "seed": 0}.items() <= stored["fit"]["settings"].items()
+    assert (stored["values"], stored["fit"]["settings"]["seed"]) == (result.values, 0)
     assert "low" not in (work / "result" / "fitted.toml").read_text()
     assert "data:image/png;base64," in (work / "result" / "report.html").read_text()
     assert "--force" in refused(words.split(), capsys, work)
 
 
 def test_results_are_compared(work, capsys, coat_fit, layerjax):
-    problem = coat_fit.problem
-    worse = replace(coat_fit, vector=coat_fit.vector + 2 * coat_fit.errors)
-    other = replace(coat_fit, problem=Problem(problem.stack, problem.data, objective="cube_root"))
-    for name, fit in (("best", coat_fit), ("worse", worse), ("root", other)):
-        save_fit(fit, name)
+    root = Problem(coat_fit.problem.stack, coat_fit.problem.data, objective="cube_root")
+    save_fit(coat_fit, "best")
+    save_fit(replace(coat_fit, vector=coat_fit.vector + 2 * coat_fit.errors), "worse")
+    save_fit(replace(coat_fit, problem=root), "root")
     words = layerjax("compare worse best --no-refit").out
     assert words.index(" best ") < words.index(" worse ")
     assert "cube_root" in refused(["compare", "best", "root"], capsys, work)
@@ -92,10 +88,11 @@ def test_many_files_are_fitted_as_one_is(work, monkeypatch, layerjax):
     assert "out/table.csv" in output.out
     assert "layerjax: fits 2/2" in output.err
     layerjax(f"fit scans/paint.csv --stack bare.toml --out alone {how}")
-    own, alone = work / "out" / "paint.csv" / "bare", work / "alone"
-    assert {path.name for path in own.iterdir()} == {path.name for path in alone.iterdir()}
-    for name in ("fitted.toml", "problem.toml", "data.csv"):
-        assert (own / name).read_text() == (alone / name).read_text(), name
+    own, alone = (
+        {path.name: path.read_text() for path in Path(at).iterdir()} for at in ("out/paint.csv/bare", "alone")
+    )
+    assert own.keys() == alone.keys()
+    assert {name for name in own if own[name] != alone[name]} <= {"fit.json"}  # which holds times
 
 
 def test_held_out_data_are_scored(work, monkeypatch, layerjax):
@@ -113,14 +110,12 @@ def test_predictions_are_written(work, capsys, coat_fit, layerjax):
     save_fit(coat_fit, "result")
     words = "predict result --incidence 30,70,20 --out new.csv"
     layerjax(words)
-    with (work / "new.csv").open() as file:
-        rows = list(csv.DictReader(file))
-    assert {row["theta_i"] for row in rows} == {"20", "30", "70"}
-    assert len(rows) == 3 * 35
-    for row in rows:
-        assert float(row["predictive_q2.5"]) < float(row["bsdf_q50"]) < float(row["predictive_q97.5"])
-        assert 0.0 < float(row["bsdf_sd"]) < float(row["predictive_sd"])
-        assert row["bsdf_mean"] == row["latent_mean"]  # no discrepancy is modelled
+    rows = np.genfromtxt(work / "new.csv", delimiter=",", names=True, deletechars="")
+    assert (set(rows["theta_i"]), len(rows)) == ({20.0, 30.0, 70.0}, 3 * 35)
+    columns = ("predictive_q2.5", "bsdf_q50", "predictive_q97.5")
+    assert np.all(np.diff([rows[name] for name in columns], axis=0) > 0.0)
+    assert np.all((rows["bsdf_sd"] > 0.0) & (rows["bsdf_sd"] < rows["predictive_sd"]))
+    assert np.all(rows["bsdf_mean"] == rows["latent_mean"])  # no discrepancy is modelled
     assert "--force" in refused(words.split(), capsys, work)
 
 

@@ -66,16 +66,13 @@ def test_an_isotropic_tree_by_hand(reading):
     assert dict(zip(data.values[:, 0], angles, strict=True)) == expected
 
 
-def test_sides_of_trees(reading):
+def test_sides_and_colours_of_trees(reading):
     sides = [f"{kind} {side}" for kind in ("Reflection", "Transmission") for side in ("Front", "Back")]
     data = reading(xml(4, *(("{0.3}", {"side": side}) for side in sides)))
     np.testing.assert_array_equal(np.sign(data.wi[:, 2]), [1, -1, 1, -1])
     np.testing.assert_array_equal(np.sign(data.wo[:, 2]), [1, -1, -1, 1])
     np.testing.assert_array_equal(data.mask, [True, True, False, False])  # one box: it holds what passes straight
-
-
-def test_colours_of_trees(reading):
-    """u' = 0.1978, v' = 0.4683 are D65: X and Z beside Y are those of the white point."""
+    # u' = 0.1978, v' = 0.4683 are D65: X and Z beside Y are those of the white point
     data = reading(xml(3, (EIGHT, {}), ("{0.19784}", {"colour": "CIE-u"}), ("{0.46834}", {"colour": "CIE-v"})))
     assert data.channels == ("X", "Y", "Z")
     white = np.tile([0.95047, 1, 1.08883], (len(data), 1))

@@ -63,16 +63,15 @@ def towards(*degrees):
 
 
 ALL = "coat", "metal", "gloss", "diffuse"
-WHITE = {
-    "rough metal": Surface(("metal",), 1.0, base_metalness=1.0, specular_roughness=0.9),
-    "gloss": Surface(("gloss", "diffuse"), 1.0, specular_roughness=0.35),
-    "all": Surface(ALL, 1.0, 0.3, base_metalness=0.5, coat_roughness=0.5),
-}
 
 
-@pytest.mark.parametrize("name", WHITE)
-def test_a_white_surface_loses_no_light(name):
-    np.testing.assert_allclose(albedo(WHITE[name], towards(0.0, 30.0, 60.0, 80.0)), 1.0, atol=1e-3)
+def test_a_white_surface_loses_no_light():
+    for white in (
+        Surface(("metal",), 1.0, base_metalness=1.0, specular_roughness=0.9),
+        Surface(("gloss", "diffuse"), 1.0, specular_roughness=0.35),
+        Surface(ALL, 1.0, 0.3, base_metalness=0.5, coat_roughness=0.5),
+    ):
+        np.testing.assert_allclose(albedo(white, towards(0.0, 30.0, 60.0, 80.0)), 1.0, atol=1e-3)
 
 
 @pytest.mark.slow

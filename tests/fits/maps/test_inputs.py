@@ -1,5 +1,6 @@
 """Measurements of a map by blocks: every source gives the same numbers, and what is wrong is named."""
 
+import os
 import pickle
 from pathlib import Path
 
@@ -115,8 +116,7 @@ def test_bad_input_is_named():
 
 def test_damaged_files_and_arrays_that_are_not_there_are_named(tmp_path):
     zarr_group(tmp_path / "v.zarr", {"values": VALUES})
-    damaged = tmp_path / "v.zarr" / "values" / "c" / "1" / "1" / "0" / "0"
-    damaged.write_bytes(damaged.read_bytes()[:20])
+    os.truncate(tmp_path / "v.zarr/values/c/1/1/0/0", 20)
     data = map_data(tmp_path / "v.zarr", VIEW)
     np.testing.assert_array_equal(data.read((slice(0, 2),)).values, VALUES[:2])  # the rest is as good as it was
     with pytest.raises(ValueError, match=r"v.zarr:/values: block \[1:4, 2:4\] cannot be read: \S"):
@@ -124,7 +124,7 @@ def test_damaged_files_and_arrays_that_are_not_there_are_named(tmp_path):
     with pytest.raises(ValueError, match="cannot be read"):
         data.fingerprint()
     np.save(tmp_path / "v.npy", VALUES)
-    (tmp_path / "v.npy").write_bytes((tmp_path / "v.npy").read_bytes()[:-100])
+    os.truncate(tmp_path / "v.npy", 1000)
     (tmp_path / "w.h5").write_bytes(b"junk")
     zarr_group(tmp_path / "two.zarr", {"first": VALUES, "second": VALUES})
     hdf5_file(tmp_path / "v.h5", {"labels": np.array([b"gloss", b"matt"])})

@@ -60,6 +60,7 @@ def test_counts_quartiles_and_the_verdict_are_those_of_the_arrays(map, painted):
     root = ET.fromstring(f"<div>{map._repr_html_()}</div>")  # of a notebook
     shown = {row[0].text: [cell.text for cell in row] for row in root.iter("tr")}
     assert tuple(shown["base.albedo"]) == middle["base.albedo"]
+    assert [report.share(part, 100_000) for part in (100_000, 99_999, 1)] == ["100 %", "99.99 %", "< 0.01 %"]
     sentences, sound = verdict(numbers, map)
     assert not sound  # 10 of 551 failed
     words = " ".join(sentences)
@@ -121,20 +122,14 @@ LEAVE = GOOD | FLAGS["unidentified"]
 def test_the_verdict_is_a_matter_of_its_thresholds(arrays, more, sound, sentences, tmp_path):
     map = stored(tmp_path / "a.zarr", arrays, CHUNK, **more)
     words, is_sound = verdict(summarise(map), map)
-    assert is_sound == sound
-    for sentence in sentences:
-        assert sentence in " ".join(words)
+    assert (is_sound, [one for one in sentences if one not in " ".join(words)]) == (sound, [])
     if more.get("common") is OFF:
         rows = (("layers[0].ior", "1.50", "0.10", "1"), ("layers[0].thickness_mm", "2", "unknown", "mm"))
         assert report.common_table(map).rows == rows
 
 
-def test_nearly_all_is_not_written_as_all():
-    for (part, whole), words in {(7, 7): "100 %", (99_999, 100_000): "99.99 %", (1, 100_000): "< 0.01 %"}.items():
-        assert report.share(part, whole) == words
-
-
-SMOOTHING = {"prior": {"kind": "gaussian", "scale": dict.fromkeys(NAMES, 0.05)}, "rounds": 3, "settled": False}
+PRIOR = {"kind": "gaussian", "scale": dict.fromkeys(NAMES, 0.05)}
+SMOOTHING = {"prior": PRIOR, "rounds": 3, "settled": False, "largest_moves": [3.0, 0.5]}
 ROUNDS = "base.albedo 0.05), in 3 rounds; "
 
 
@@ -150,9 +145,8 @@ def test_maps_in_every_state_are_reported_as_one_whole_file(state, count, words,
     arrays, chunk = (numbers((5, 4, 4)), (5, 4, 4)) if state == "smoothed" else (painted, CHUNK)
     map = stored(tmp_path / "<coat> & co.zarr", arrays, chunk, chunks=0 if state == "empty" else None)
     if state == "smoothed":
-        groups = {f"{group}/{name}": map[f"{group}/{name}"][:] for group in ("values", "errors") for name in NAMES}
-        about = {"smoothing": SMOOTHING | {"largest_moves": [3.0, 0.5]}, "finished": True}
-        Store(map.path).save_group("smoothed", groups, about)
+        groups = {name: map[name][:] for name in map.arrays if "/" in name}
+        Store(map.path).save_group("smoothed", groups, {"smoothing": SMOOTHING, "finished": True})
     fits.report(map, path=tmp_path / "report.html")
     text = (tmp_path / "report.html").read_text()
     captions = re.findall(r'<img alt="([^"]*)" src="data:image/png;base64,[^"]{1000,}">', text)
@@ -166,7 +160,6 @@ def test_maps_in_every_state_are_reported_as_one_whole_file(state, count, words,
     ET.fromstring(re.sub(r"(<img [^>]*[^/])>", r"\1/>", body))  # it is well formed
     text = re.sub(r"base64,[^\"]*", "", text)
     assert "http" not in text
-    assert "<coat>" not in text
     made = ("Noise(relative=0.02)", "poor above 1.6", "kind = &quot;Medium&quot;")
     common = 'layers[0].f0</td><td class="number">0.04321</td><td class="number">0.00012'
     for one in ("Map of &lt;coat&gt; &amp; co.zarr", *made, *([common] if count > 1 else []), *words):

@@ -185,7 +185,7 @@ def test_another_prior_smooths_anew_and_fits_nothing_again(tmp_path, smoothed, f
     assert fitted(out).smoothed is not None  # and stays
 
 
-def test_invalid_spatial_priors_are_refused(tmp_path, measured):
+def test_scales_are_positive_and_of_parameters_that_there_are(tmp_path, measured):
     for options, words in (
         ({"scale": {"albedo": 0.1}}, r"names 'albedo'; it must be one of layers\[0\].thickness, base.albedo"),
         ({"objective": "cosine_l2", "stack": quick_maps.FREE}, "objective 'cosine_l2' has no noise"),
@@ -199,9 +199,6 @@ def test_invalid_spatial_priors_are_refused(tmp_path, measured):
         with pytest.raises(ValueError, match=words):
             quick_maps.fitted(tmp_path / "no.zarr", measured[0], **more, spatial_prior=fits.SpatialPrior(**prior))
         assert not (tmp_path / "no.zarr").exists()
-
-
-def test_all_channels_of_a_parameter_have_its_scale():
-    names = ["base.albedo[0]", "base.albedo[1]", "layers[0].thickness"]
+    names = ["base.albedo[0]", "base.albedo[1]", "layers[0].thickness"]  # all channels of a parameter have its scale
     assert fits.SpatialPrior("gaussian", {"base.albedo": 0.1}).scales(names) == dict.fromkeys(names[:2], 0.1)
     assert fits.SpatialPrior("gaussian", 0.2).scales(names) == dict.fromkeys(names, 0.2)

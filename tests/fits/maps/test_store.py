@@ -3,6 +3,7 @@ and what is where a store is to be is resumed, refused by name, or thrown away i
 
 import errno
 import json
+import os
 import shutil
 from pathlib import Path
 
@@ -73,8 +74,7 @@ def test_zarr_and_xarray_read_it_without_us(map, tmp_path):
 
 def test_a_full_disk_in_the_midst_of_a_chunk_is_named_and_the_chunk_is_not_there(tmp_path, monkeypatch):
     store = Store(stored(tmp_path / "a.zarr", numbers(SHAPE), CHUNK, chunks=1).path)
-    for written in (np.isfinite(store.values["base.albedo"]), store.flags != 0):
-        np.testing.assert_array_equal(np.argwhere(written), np.argwhere(np.ones(CHUNK)))
+    np.testing.assert_array_equal(np.argwhere(store.flags), np.argwhere(np.ones(CHUNK)))
     with full_disk(monkeypatch, 5), pytest.raises(OSError, match="space") as caught:
         write(store, BLOCKS[1])
     assert (caught.value.errno, caught.value.filename) == (errno.ENOSPC, str(tmp_path / "a.zarr"))
@@ -173,8 +173,7 @@ def test_what_is_not_ours_is_never_touched(tmp_path, measured):
 
 @pytest.mark.parametrize("damaged", ["pilot/zarr.json", "pilot/starts/c/0/0", "pilot", "flags"])
 def test_a_damaged_store_is_named_and_can_be_replaced(out, measured, whole, damaged):
-    place = out / damaged
-    shutil.rmtree(place) if place.is_dir() else place.write_bytes(place.read_bytes()[:10])
+    shutil.rmtree(out / damaged) if (out / damaged).is_dir() else os.truncate(out / damaged, 10)
     with pytest.raises(ValueError, match=rf"{out}.*: damaged"):
         fitted(out, measured)
     assert_same(fitted(out, measured, force=True), whole)
