@@ -88,9 +88,8 @@ def test_many_files_are_fitted_as_one_is(work, monkeypatch, layerjax):
     assert "out/table.csv" in output.out
     assert "layerjax: fits 2/2" in output.err
     layerjax(f"fit scans/paint.csv --stack bare.toml --out alone {how}")
-    own, alone = (
-        {path.name: path.read_text() for path in Path(at).iterdir()} for at in ("out/paint.csv/bare", "alone")
-    )
+    folders = Path("out/paint.csv/bare"), Path("alone")
+    own, alone = ({path.name: path.read_text() for path in folder.iterdir()} for folder in folders)
     assert own.keys() == alone.keys()
     assert {name for name in own if own[name] != alone[name]} <= {"fit.json"}  # which holds times
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import layerjax as lj
-from fits import MapOptions, Noise, SpatialPrior
+from fits import Free, MapOptions, Noise, SpatialPrior
 from fits.cli.parser import main
 from fits.maps.store import FLAGS
 from tests.helpers.commands import refused
@@ -69,9 +69,8 @@ def test_defaults_and_options_arrive(place, run):
         "--processes 3 --emulator never --spatial-prior gaussian --spatial-scale 0.1"
     )
     counts = {"starts": 3, "seed": 5, "pilot_texels": 9, "chunk_size": 100, "processes": 3}
-    prior, options = SpatialPrior("gaussian", 0.1), given["options"]
-    assert options.scale.high == 1.2
-    assert replace(options, scale=None) == MapOptions(**counts, emulator=False, force=True, spatial_prior=prior)
+    more = {"emulator": False, "force": True, "spatial_prior": SpatialPrior("gaussian", 0.1)}
+    assert given["options"] == MapOptions(scale=Free(1, 0.8, 1.2), **counts, **more)
     assert (given["sigma"], given["mask"], given["noise"]) == ("sigma.npy", "mask.npy", Noise(0.02, tails="student"))
     _, given = run("--scheduler tcp://10.0.0.1:8786 --emulator always")
     assert given["client"] == "tcp://10.0.0.1:8786"
@@ -87,8 +86,7 @@ def test_what_was_found_is_printed_and_a_map_that_did_not_converge_is_doubtful(r
     assert rows["layers[0].f0"] == ["layers[0].f0", "0.04321", "0.00012", "1"]
     assert "layerjax report coat.zarr" in output.out
     assert "texels 5/10" in output.err
-    for state in ({"failing": 1}, {"failing": 8}, {"chunks": 1}):
-        assert run(**state)[0] == 1
+    assert run(failing=1)[0] == run(chunks=1)[0] == 1
 
 
 @pytest.mark.parametrize(

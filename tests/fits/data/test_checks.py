@@ -61,9 +61,8 @@ def test_repeats_tell_the_noise() -> None:
 
 def test_a_peak_on_the_side_of_the_light_is_told_of() -> None:
     """Azimuths that count from the mirror direction: what is read is mirrored."""
-    right, turned = (
-        measured(0.05 + np.exp(-(((SIGNED - sign * SCANS.theta_i) / 8.0) ** 2)), SCANS) for sign in (1, -1)
-    )
+    peaks = ((SIGNED - sign * SCANS.theta_i) / 8.0 for sign in (1, -1))
+    right, turned = (measured(0.05 + np.exp(-(peak**2)), SCANS) for peak in peaks)
     assert "the brightest side is the light's: at 10° up to 1.05 there" in statement(turned, "Sides")
     assert "phi_o = phi_i + 180" in statement(turned, "Sides")
     one_side = turned.where(SIGNED < 1.0).used()

@@ -84,10 +84,8 @@ def test_a_spread_beside_a_single_value_column_is_taken_for_its_own(reading, col
 def test_what_was_not_measured_is_left_out_and_counted(reading, missing):
     rows = f"10,180,20,0,1,0.1,7\n10,180,25,0,{missing},0.1,8\n10,180,30,0,3,{missing},{missing}\n"
     data = reading(f"{HEADER},brdf_std,reflectance_factor\n{rows}", quantity="brdf")
-    # sigma, where it is unknown: as much of the value as where it is known
-    np.testing.assert_allclose(
-        np.stack([data.values[:, 0], data.theta_o, data.sigma[:, 0]]), [[1, 3], [20, 30], [0.1, 0.3]]
-    )
+    numbers = np.stack([data.theta_o, data.values[:, 0], data.sigma[:, 0]], axis=1)
+    np.testing.assert_allclose(numbers, [[20, 1, 0.1], [30, 3, 0.3]])  # unknown: of the value as where it is known
     assert data.source.notes[0] == "skipped: 1 data point without a value (an empty cell, or nan)"
     colours = reading(f"theta_i,theta_o,brdf_red,brdf_blue\n10,20,1,{missing}\n10,25,{missing},1\n10,30,1,2\n")
     np.testing.assert_array_equal(colours.values, [[1, 2]])
@@ -132,12 +130,9 @@ def test_written_csv_comes_back_exactly(tmp_path):
     assert again.channels == data.channels
     assert again.source.attribution == "A. Author, MIT"
     assert {"first note", "second note", "written by layerjax from somewhere (memory)"} <= set(again.source.notes)
-    for path, message in (
-        (tmp_path / "out.csv", "the file exists already"),
-        (tmp_path / "no/a.csv", "is no directory"),
-    ):
+    for path, message in {"out.csv": "the file exists already", "no/new.csv": "there is no directory"}.items():
         with pytest.raises(ValueError, match=message):
-            write_csv(data, path)
+            write_csv(data, tmp_path / path)
 
 
 def test_channels_come_back_or_are_not_written(tmp_path):

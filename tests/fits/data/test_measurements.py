@@ -49,10 +49,8 @@ def test_masks_narrow_and_are_noted():
     both = ReadOptions(min_retro_angle=8, max_polar_angle=75).masked(data)
     np.testing.assert_array_equal(both.mask, [True, False, False])
     assert both.used().values.ravel().tolist() == [1]
-    assert both.source.notes == (
-        "masked: within 8 degrees of retro-reflection",
-        "masked: more than 75 degrees from the normal",
-    )
+    words = ("within 8 degrees of retro-reflection", "more than 75 degrees from the normal")
+    assert both.source.notes == tuple(f"masked: {one}" for one in words)
     zero = measurements(sigma=np.array([[0.0], [0.1], [0.1]]), mask=np.array([False, True, True]))
     assert len(zero.used()) == 2  # a sigma of zero stands where nothing is used
     with pytest.raises(ValueError, match="read-only"):

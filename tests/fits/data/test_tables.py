@@ -172,9 +172,8 @@ def test_directions_below_the_horizon_and_tables_twice_are_no_data(reading):
 
 def test_a_fred_file_is_the_csv_plus_the_laboratory_floor():
     """The laboratory shifted its readings by one constant before it wrote this file: f cos theta_o differs by that."""
-    fred, csv = (
-        read(COATINGS / name) for name in ("AnoBlackNiTEonSteel.txt", "nite_on_blasted_steel1008_650nm_hemisphere.csv")
-    )
+    names = "AnoBlackNiTEonSteel.txt", "nite_on_blasted_steel1008_650nm_hemisphere.csv"
+    fred, csv = (read(COATINGS / name) for name in names)
     places, there = (np.hstack([data.wi, data.wo]).round(6) + 0.0 for data in (fred, csv))
     known = {tuple(place): value for place, value in zip(there, csv.values[:, 0], strict=True)}
     theirs = np.array([known.get(tuple(place), np.nan) for place in places])

@@ -84,9 +84,8 @@ def changed(**arrays):
 
 def flagged(texels, flag, ratio=RATIO):
     """So many texels with this flag and this chi-square."""
-    return changed(
-        flags=np.where(texels > PLACES, flag, GOOD), reduced_chi_square=np.where(texels > PLACES, ratio, RATIO)
-    )
+    where = texels > PLACES
+    return changed(flags=np.where(where, flag, GOOD), reduced_chi_square=np.where(where, ratio, RATIO))
 
 
 SCALED = {factor: changed(reduced_chi_square=factor * RATIO) for factor in (0.3, 1.7)}
