@@ -130,6 +130,8 @@ def test_written_csv_comes_back_exactly(tmp_path):
     assert again.channels == data.channels
     assert again.source.attribution == "A. Author, MIT"
     assert {"first note", "second note", "written by layerjax from somewhere (memory)"} <= set(again.source.notes)
+    write_csv(replace(data, sigma=None), tmp_path / "bare.csv")
+    assert read(tmp_path / "bare.csv").sigma is None
     for path, message in {"out.csv": "the file exists already", "no/new.csv": "there is no directory"}.items():
         with pytest.raises(ValueError, match=message):
             write_csv(data, tmp_path / path)

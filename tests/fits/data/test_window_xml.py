@@ -49,18 +49,19 @@ def test_rings_stand_for_no_more_patches_than_there_may_be(reading):
     assert peak < 200e6  # 40 million patches would take a GB
 
 
-EIGHT = "{ {1} {2} {3} {4} {5} {6} {7} { 10 11 12 13 14 15 16 17 } }"
+TREE = "{ {1} {2} {3} {4} {5} {6} {%s} {8} }"
 
 
-def test_an_isotropic_tree_by_hand(reading):
+@pytest.mark.parametrize("fine", ["7", " 10 11 12 13 14 15 16 17 "])
+def test_an_isotropic_tree_by_hand(reading, fine):
     """The first axis is the lowest bit of a node, and the slowest of a grid; squares become circles."""
-    data = reading(xml(3, ("{ {1} {0} {3} {0} {5} {0} { 10 11 12 13 14 15 16 17 } {0} }", {})))
+    data = reading(xml(3, (TREE % fine, {})))
     np.testing.assert_allclose(data.phi_i, 180.0)
     angles = np.round([data.theta_i, data.theta_o, data.phi_o], 2).T.tolist()
     low, high = np.round(np.degrees(np.arcsin([0.25, 0.75])), 2)
     # x is ahead of the light, y turned with z; along a side of a square azimuths are even
-    expected = {1: [30, 30, 135], 3: [30, 30, 45], 5: [30, 30, 225]}
-    for first, theta_i in ((10, high), (14, low)):
+    expected = {1: [30, 30, 135], 3: [30, 30, 45], 5: [30, 30, 225]} | ({7: [30, 30, 315]} if fine == "7" else {})
+    for first, theta_i in ((10, high), (14, low)) if fine != "7" else ():
         for place, phi in enumerate((315, 285, 345, 315)):
             expected[first + place] = [theta_i, high if place else low, phi]
     assert dict(zip(data.values[:, 0], angles, strict=True)) == expected
@@ -73,7 +74,12 @@ def test_sides_and_colours_of_trees(reading):
     np.testing.assert_array_equal(np.sign(data.wo[:, 2]), [1, -1, -1, 1])
     np.testing.assert_array_equal(data.mask, [True, True, False, False])  # one box: it holds what passes straight
     # u' = 0.1978, v' = 0.4683 are D65: X and Z beside Y are those of the white point
-    data = reading(xml(3, (EIGHT, {}), ("{0.19784}", {"colour": "CIE-u"}), ("{0.46834}", {"colour": "CIE-v"})))
+    tree, v = (TREE % "7", {}), ("{0.46834}", {"colour": "CIE-v"})
+    data = reading(xml(3, tree, ("{0.19784}", {"colour": "CIE-u"}), v))
     assert data.channels == ("X", "Y", "Z")
     white = np.tile([0.95047, 1, 1.08883], (len(data), 1))
     np.testing.assert_allclose(data.values / data.values[:, 1:2], white, rtol=1e-3)
+    # in boxes of its own, a tenth of what Y is there: X is 9 u' / 4 v' of it
+    u = "{ {.1} {.2} {.3} {.4} {.5} {.6} {" + ".7 " * 8 + "} {.8} }"
+    data = reading(xml(3, tree, (u, {"colour": "CIE-u"}), v))
+    np.testing.assert_allclose(data.values[:, 0], 0.225 * data.values[:, 1] ** 2 / 0.46834)
