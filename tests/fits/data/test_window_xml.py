@@ -49,10 +49,10 @@ def test_rings_stand_for_no_more_patches_than_there_may_be(reading):
     assert peak < 200e6  # 40 million patches would take a GB
 
 
-TREE = "{ {1} {2} {3} {4} {5} {6} {%s} {8} }"
+TREE, FINE = "{ {1} {2} {3} {4} {5} {6} {%s} {8} }", " 10 11 12 13 14 15 16 17 "
 
 
-@pytest.mark.parametrize("fine", ["7", " 10 11 12 13 14 15 16 17 "])
+@pytest.mark.parametrize("fine", ["7", FINE])
 def test_an_isotropic_tree_by_hand(reading, fine):
     """The first axis is the lowest bit of a node, and the slowest of a grid; squares become circles."""
     data = reading(xml(3, (TREE % fine, {})))
@@ -74,12 +74,12 @@ def test_sides_and_colours_of_trees(reading):
     np.testing.assert_array_equal(np.sign(data.wo[:, 2]), [1, -1, -1, 1])
     np.testing.assert_array_equal(data.mask, [True, True, False, False])  # one box: it holds what passes straight
     # u' = 0.1978, v' = 0.4683 are D65: X and Z beside Y are those of the white point
-    tree, v = (TREE % "7", {}), ("{0.46834}", {"colour": "CIE-v"})
+    tree, v = (TREE % FINE, {}), ("{0.46834}", {"colour": "CIE-v"})
     data = reading(xml(3, tree, ("{0.19784}", {"colour": "CIE-u"}), v))
     assert data.channels == ("X", "Y", "Z")
     white = np.tile([0.95047, 1, 1.08883], (len(data), 1))
     np.testing.assert_allclose(data.values / data.values[:, 1:2], white, rtol=1e-3)
-    # in boxes of its own, a tenth of what Y is there: X is 9 u' / 4 v' of it
-    u = "{ {.1} {.2} {.3} {.4} {.5} {.6} {" + ".7 " * 8 + "} {.8} }"
+    # u' a hundredth of what Y is there: X is 9 u' / 4 v' of it
+    u = "{ {.01} {.02} {.03} {.04} {.05} {.06} { .1 .11 .12 .13 .14 .15 .16 .17 } {.08} }"
     data = reading(xml(3, tree, (u, {"colour": "CIE-u"}), v))
-    np.testing.assert_allclose(data.values[:, 0], 0.225 * data.values[:, 1] ** 2 / 0.46834)
+    np.testing.assert_allclose(data.values[:, 0], 0.0225 * data.values[:, 1] ** 2 / 0.46834)
