@@ -95,10 +95,12 @@ def test_what_was_found_is_printed_and_a_map_that_did_not_converge_is_doubtful(r
         ("map.npy=nowhere.npy", "nowhere.npy: no such file"),
         ("map.npy=.", "layerjax fit-many"),
         ("view.csv=coat.toml", "coat.toml, line"),
+        ("coat.zarr=file.zarr", "file.zarr: is no store of a fitted map"),
         ("coat.zarr=coat.h5", "coat.h5: a fitted map can be written as .zarr only"),
         ("--spatial-prior gaussian", "--spatial-prior needs --spatial-scale"),
     ],
 )
 def test_bad_input_is_named(place, capsys, words, message):
+    (place / "file.zarr").write_text("")
     change, more = ({}, words.split()) if words.startswith("--") else (dict([words.split("=")]), [])
     assert message in refused([*(change.get(word, word) for word in WORDS), *more], capsys, place)

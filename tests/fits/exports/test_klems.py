@@ -74,9 +74,9 @@ def test_colours_are_xyz_and_an_opaque_stack_has_no_back(tmp_path):
     assert data.channels == ("X", "Y", "Z")
     np.testing.assert_allclose(data.values, np.tile(WHITE @ [0.8, 0.4, 0.2] / np.pi, (145**2, 1)), rtol=1e-5)
     text = (tmp_path / "paint.xml").read_text()
-    (tmp_path / "paint.xml").write_text(text.replace("Reflection Front", "Reflection Back", 1))  # of X alone
+    (tmp_path / "paint.xml").write_text(text.replace("Reflection Front", "Reflection Back", 1))  # of Y alone
     data = fits.read(tmp_path / "paint.xml")
-    assert (len(data), data.source.notes[-1]) == (145**2, "skipped: X, the blocks are not those of the visible")
+    assert (len(data), data.source.notes[-1]) == (145**2, "skipped: X and Z, the blocks are not those of the visible")
 
 
 def test_what_is_written_is_read_with_axes_that_are_not_turned(sheet_file):
