@@ -46,6 +46,12 @@ def writer(path, hold=""):
         yield process
 
 
+def fill(path, until=60):
+    with Store.open(path, WHOSE) as store:
+        for number in range(len(store.all("steps")), until):
+            store.append("steps", {"number": number, "coords": np.full((8, 32, 3), number)})
+
+
 def steps_of(store):
     """How many steps were kept, all of which must be as they were written."""
     steps = store.all("steps")
@@ -83,9 +89,8 @@ def test_records_come_back(tmp_path):
             assert one.fingerprint == WHOSE
             found = one.get("record")
             np.testing.assert_equal(found, record)
-            assert {key: found[key].dtype for key in ("coords", "none", "device")} == {
-                key: record[key].dtype for key in ("coords", "none", "device")
-            }
+            for key in ("coords", "none", "device"):
+                assert found[key].dtype == record[key].dtype
         with pytest.raises(TypeError, match="object cannot be kept in a store"):
             again.put("record", {"it": object()})
     assert [one.name for one in tmp_path.iterdir()] == ["store"]
@@ -126,12 +131,6 @@ def test_readers_change_nothing_and_a_second_writer_is_refused(tmp_path):
             assert steps_of(store) == 6
 
 
-def fill(path):
-    with Store.open(path, WHOSE) as store:
-        for number in range(len(store.all("steps")), 60):
-            store.append("steps", {"number": number, "coords": np.full((8, 32, 3), number)})
-
-
 def test_a_full_disk_costs_the_record_that_was_written(tmp_path):
     path = tmp_path / "store"
     with largest_file(100_000), pytest.raises(OSError, match="No space left") as error:
@@ -144,12 +143,10 @@ def test_a_full_disk_costs_the_record_that_was_written(tmp_path):
 
 def test_a_store_that_is_removed_or_replaced_while_it_is_written_is_said_to_be(tmp_path):
     path = tmp_path / "store"
-    for replaced in (False, True):
+    for change in (path.unlink, lambda: write_text(path, "", force=True)):
         with Store.open(path, WHOSE, fresh=True) as store:
             store.put("one", 1)
-            path.unlink()
-            if replaced:
-                path.touch()
+            change()
             with pytest.raises(FileNotFoundError, match="Removed, or replaced, while it was written") as caught:
                 store.put("two", 2)
         assert caught.value.filename == str(path)
@@ -157,10 +154,7 @@ def test_a_store_that_is_removed_or_replaced_while_it_is_written_is_said_to_be(t
 
 def test_damage_is_reported_and_never_read(tmp_path):
     path = tmp_path / "store"
-    with Store.open(path, WHOSE) as store:
-        for number in range(6):
-            store.append("steps", {"number": number, "coords": np.full((8, 32, 3), number)})
-        store.put("last", 5)
+    fill(path, 6)
     whole, reported = path.read_bytes(), 0
     places = [*range(0, 8192, 64), *range(8192, len(whole), 512)]
     for place in places:
@@ -178,9 +172,9 @@ def test_damage_is_reported_and_never_read(tmp_path):
     assert reported > len(places) / 2
     for length in (100, 4096, len(whole) - 4096):
         path.write_bytes(whole[:length])
-        for call in (lambda: Store.read(path), lambda: Store.open(path, WHOSE).__enter__()):
+        for call in (Store.read, lambda path: Store.open(path, WHOSE).__enter__()):
             with pytest.raises(ValueError, match="store: damaged, or no store of this version"):
-                call()
+                call(path)
     with Store.open(path, WHOSE, fresh=True) as store:
         assert keys(store) == []
 
@@ -218,11 +212,8 @@ def test_the_work_of_another_problem_is_refused_by_name(tmp_path):
 @pytest.mark.parametrize(
     ("one", "other"),
     [
-        (1, 2),
         (None, 0.0),
-        ("a", "b"),
         ("a" * 100, "a" * 99),
-        (np.zeros(2), np.zeros(3)),
         (np.zeros((2, 3)), np.zeros((3, 2))),
         (np.zeros(2), np.zeros(2, np.float32)),
         ([np.zeros(2), 1], [np.zeros(2), 2]),

@@ -75,9 +75,8 @@ def test_a_killed_search_resumes_and_finds_the_same(data, directory, found, monk
     again = search(data, LIBRARY, options=OPTIONS, directory=directory, **GIVEN)
     assert len(made) == 5
     for one, other in zip(again.candidates, found.candidates, strict=True):
-        assert one.name == other.name
+        assert (one.name, one.model_score) == (other.name, other.model_score)
         np.testing.assert_array_equal(one.fit.vector, other.fit.vector)
-        assert one.model_score == other.model_score
 
 
 @pytest.mark.parametrize("correlated", [pytest.param(0.2, marks=pytest.mark.slow), 1.0])
@@ -114,9 +113,6 @@ def test_every_structure_has_the_instrument_and_another_search_is_refused(data, 
         refused("in use by another process")
     store.write_bytes(before[str(store)][:6000])
     refused(rf"{STORE}: damaged")
-
-
-def test_there_are_no_more_than_six_layers():
     with pytest.raises(ValueError, match="layers: 9 is not a whole number from 0 to 6"):
         SearchOptions(layers=9)
 
@@ -127,8 +123,7 @@ def test_it_is_reported_with_one_verdict(found):
     assert table.rows[0][0] == "haze / diffuse"
     assert "others were fitted with independent noise only" in table.note or len(table.rows) == len(found.candidates)
     words = " ".join(structure_search.search_sentences(found))
-    assert "Of 4 models, haze / diffuse has the best cross-validated predictive score." in words
-    assert "It is ahead of every other cross-validated model by more than the error of the difference." in words
+    assert "Of 4 models, haze / diffuse has the best cross-validated predictive score. It is ahead of every" in words
     assert "indistinguishable" not in words
     close = {one: replace(one, model_score=replace(one.model_score, clear_diff=-1.0)) for one in found.candidates[:2]}
     near = replace(found, candidates=tuple(close.get(one, one) for one in found.candidates))
@@ -144,9 +139,8 @@ def test_it_is_reported_with_one_verdict(found):
 
 def test_stacks_of_the_default_are_put_together_from_the_top():
     library = default_library()
-    stack = library.stack(("haze", "interface", "pigment"))
-    assert [type(layer).__name__ for layer in stack.layers] == ["Medium", "Interface", "Medium"]
-    assert stack.base is None
+    layers = library.stack(("haze", "interface", "pigment")).layers
+    assert [type(layer).__name__ for layer in layers] == ["Medium", "Interface", "Medium"]
     assert library.stack(("metal",)).base is library.bases["metal"].base
     for channels in (1, 3):  # every part is free, and has as many colours
         library = default_library(channels)
@@ -169,9 +163,8 @@ def test_a_file_says_the_same(tmp_path):
     assert library.stack(("coat", "deep")).base is None
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
+def test_bad_files_are_refused(tmp_path):
+    for text, message in (
         (DIFFUSE, "it has no layers"),
         (INTERFACE, "it has no bases"),
         (INTERFACE.replace("Interface", "Lambertian"), "layers.coat: layers.0..kind is 'Lambertian'"),
@@ -180,10 +173,8 @@ def test_a_file_says_the_same(tmp_path):
         ("[stack]\n", "stack"),
         (INTERFACE + DIFFUSE.replace("diffuse", "coat"), "'coat' is there twice; names must differ"),
         (INTERFACE + DIFFUSE + DIFFUSE.replace("diffuse", "Diffuse"), "'diffuse' is there twice"),
-    ],
-)
-def test_bad_files_are_refused(tmp_path, text, message):
-    (tmp_path / "library.toml").write_text(text)
-    with pytest.raises(ValueError, match=message) as caught:
-        read_library(tmp_path / "library.toml")
-    assert str(caught.value).startswith(str(tmp_path / "library.toml"))
+    ):
+        (tmp_path / "library.toml").write_text(text)
+        with pytest.raises(ValueError, match=message) as caught:
+            read_library(tmp_path / "library.toml")
+        assert str(caught.value).startswith(str(tmp_path / "library.toml"))

@@ -1,4 +1,4 @@
-"""A small map of a coat over a diffuse base that is fitted in no time, in memory and as the files of a user."""
+"""A small map of a coat over a diffuse base that is fitted in no time."""
 
 import errno
 import os
@@ -19,17 +19,6 @@ from tests.helpers.files import contents
 
 TRANSPORT, NOISE = lj.SingleScattering(), fits.Noise(relative=0.02)
 NAMES = ("layers[0].thickness", "base.albedo")
-STACK = """transport = "SingleScattering"
-[[layers]]
-kind = "Medium"
-thickness = { start = 0.5, low = 0.05, high = 3.0 }
-albedo = 0.8
-phase = { kind = "HenyeyGreenstein", g = 0.3 }
-[base]
-kind = "Lambertian"
-albedo = { start = 0.4, low = 0.0, high = 1.0 }
-"""
-OPTIONS = {"--noise": "0.02", "--chunk-size": "16", "--pilot-texels": "8", "--starts": "2"}
 
 
 def coat(thickness, albedo):
@@ -76,23 +65,6 @@ def fitted(out: Path, given: np.ndarray, stack=FREE, view=None, **options) -> Fi
     return fits.fit_map(stack, view, given, out, options=MapOptions(**chosen), **arguments)
 
 
-def write_files(folder: Path, shape: tuple[int, ...]) -> None:
-    """map.npy, view.csv and coat.toml."""
-    view = geometry()
-    np.save(folder / "map.npy", values(shape))
-    angles = np.column_stack([view.theta_i, view.phi_i, view.theta_o, view.phi_o])
-    np.savetxt(folder / "view.csv", angles, delimiter=",", header="theta_i,phi_i,theta_o,phi_o", comments="")
-    (folder / "coat.toml").write_text(STACK)
-
-
-def command(folder: Path, out: Path, *more: str) -> list[str]:
-    """The words of `layerjax fit-map` for these files."""
-    files = {"--geometry": "view.csv", "--stack": "coat.toml"}
-    words = ["fit-map", str(folder / "map.npy"), "--out", str(out)]
-    words += [word for option, name in files.items() for word in (option, str(folder / name))]
-    return [*words, *(word for pair in OPTIONS.items() for word in pair), *more]
-
-
 def assert_same(found: FittedMap, expected: FittedMap) -> None:
     """To the bit: every file of the stores."""
     one, other = (
@@ -116,3 +88,13 @@ def full_disk(monkeypatch: pytest.MonkeyPatch, after: int | None) -> Iterator[No
     with monkeypatch.context() as patch:
         patch.setattr(Path, "replace", full)
         yield
+
+
+def stop_at(stage, done=0):
+    """Progress that interrupts its run when so much of a stage is done."""
+
+    def stop(*told):
+        if told[0] == stage and told[1] >= done:
+            raise KeyboardInterrupt
+
+    return stop

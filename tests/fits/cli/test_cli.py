@@ -1,6 +1,5 @@
 """The `layerjax` command at work: every command writes and prints what it should."""
 
-import csv
 import io
 import json
 import os
@@ -8,11 +7,11 @@ import subprocess
 import sys
 import warnings
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-import layerjax as lj
 from fits import Problem, load_fit, load_posterior, progress, read, save_fit, slices
 from fits.cli import commands
 from fits.cli.arguments import COMMANDS
@@ -31,29 +30,25 @@ TRUE = {"layers[0].thickness": 0.6, "base.albedo": 0.4}  # of the stack behind c
 def test_fit_writes_a_result(work, capsys, coat_toml, layerjax):
     words = "fit data.csv --stack coat.toml --out result --starts 4"
     output = layerjax(f"{words} --max-polar-angle 80")
-    for word in ("layers[0].thickness", "base.albedo", "chi2/dof", "4 starts", "result/report.html"):
-        assert word in output.out
-    assert "fit 4/4" in output.err
+    for word in (*TRUE, "chi2/dof", "4 starts", "result/report.html", "fit 4/4"):
+        assert word in output.out + output.err
     result = load_fit("result")
-    assert result.problem.data.theta_o[result.problem.data.mask].max() <= 80
+    assert result.problem.data.used().theta_o.max() <= 80
     for name, truth in TRUE.items():
         assert abs(result.values[name] - truth) < 4 * result.standard_errors[name]
     assert (work / "result" / "problem.toml").read_text() == coat_toml.read_text()
     stored = json.loads((work / "result" / "fit.json").read_text())
-    assert stored["versions"]["jax"]
-    assert stored["values"] == result.values
-    assert {"starts": 4, "seed": 0}.items() <= stored["fit"]["settings"].items()
+    assert (stored["values"], stored["fit"]["settings"]["seed"]) == (result.values, 0)
     assert "low" not in (work / "result" / "fitted.toml").read_text()
     assert "data:image/png;base64," in (work / "result" / "report.html").read_text()
     assert "--force" in refused(words.split(), capsys, work)
 
 
 def test_results_are_compared(work, capsys, coat_fit, layerjax):
-    problem = coat_fit.problem
-    worse = replace(coat_fit, vector=coat_fit.vector + 2 * coat_fit.errors)
-    other = replace(coat_fit, problem=Problem(problem.stack, problem.data, objective="cube_root"))
-    for name, fit in (("best", coat_fit), ("worse", worse), ("root", other)):
-        save_fit(fit, name)
+    root = Problem(coat_fit.problem.stack, coat_fit.problem.data, objective="cube_root")
+    save_fit(coat_fit, "best")
+    save_fit(replace(coat_fit, vector=coat_fit.vector + 2 * coat_fit.errors), "worse")
+    save_fit(replace(coat_fit, problem=root), "root")
     words = layerjax("compare worse best --no-refit").out
     assert words.index(" best ") < words.index(" worse ")
     assert "cube_root" in refused(["compare", "best", "root"], capsys, work)
@@ -68,21 +63,15 @@ def test_sampling_resumes_until_it_is_enough(work, capsys, coat_fit, monkeypatch
     assert "no estimates yet" in (work / "result" / "report.html").read_text()
     assert not (work / "result" / "summary.json").exists()
     posterior = load_posterior("result")
-    assert posterior is not None
     assert posterior.chain.shape[:2] == (100, 8)
-    with pytest.raises(ValueError, match="too short"):
-        posterior.summary()
     assert "(walkers 8, not 10)" in refused(["sample", "result", "--walkers", "10"], capsys, work)
-
     assert "effective samples" in layerjax("sample result --max-steps 5000").out  # the chain's own walkers
     longer = load_posterior("result")
-    assert longer is not None
     np.testing.assert_array_equal(longer.chain[:100], posterior.chain)
     for name, entry in json.loads((work / "result" / "summary.json").read_text())["parameters"].items():
         assert abs(entry["mean"] - coat_fit.values[name]) < coat_fit.standard_errors[name]
         assert entry["low_68"] < entry["median"] < entry["high_68"]
-    pictures = (work / "result" / "report.html").read_text().count("data:image/png")
-    assert pictures == 3  # curves, maps, corner
+    assert (work / "result" / "report.html").read_text().count("data:image/png") == 3  # curves, maps, corner
     monkeypatch.setattr(FitReport, "write", lambda *_: None)
     said = layerjax(f"sample result --ess 1000000 --max-steps {len(longer.chain)}", 1).out
     assert f"layerjax sample result --ess 1000000 --max-steps {2 * len(longer.chain)}" in said
@@ -95,44 +84,37 @@ def test_many_files_are_fitted_as_one_is(work, monkeypatch, layerjax):
     how = "--starts 2 --max-polar-angle 80"
     many = f"fit-many scans --stacks bare.toml --out out --processes 1 {how}"
     output = layerjax(many, 1)  # one file is broken
-    for words in ("broken.csv", "failed", "paint.csv", "1 of 2 fits are there", "out/table.csv"):
-        assert words in output.out
+    assert "1 of 2 fits are there" in output.out
+    assert "out/table.csv" in output.out
     assert "layerjax: fits 2/2" in output.err
     layerjax(f"fit scans/paint.csv --stack bare.toml --out alone {how}")
-    own, alone = work / "out" / "paint.csv" / "bare", work / "alone"
-    assert {path.name for path in own.iterdir()} == {path.name for path in alone.iterdir()}
-    for name in ("fitted.toml", "problem.toml", "data.csv"):
-        assert (own / name).read_text() == (alone / name).read_text(), name
-    assert "starts 2, not 3" in layerjax(f"{many} --starts 3", 2).err
+    folders = Path("out/paint.csv/bare"), Path("alone")
+    own, alone = ({path.name: path.read_text() for path in folder.iterdir()} for folder in folders)
+    assert own.keys() == alone.keys()
+    assert {name for name in own if own[name] != alone[name]} <= {"fit.json"}  # which holds times
 
 
 def test_held_out_data_are_scored(work, monkeypatch, layerjax):
     monkeypatch.setattr(FitReport, "write", lambda *_: None)
     words = "fit data.csv --stack coat.toml --out result --starts 2 --select azimuth=0 --hold-out incidence=50"
-    output = layerjax(words).out
-    assert "Held-out data" in output
-    assert "θᵢ = 50°" in output
+    assert "Held-out data" in layerjax(words).out
     data = load_fit("result").problem.data
     np.testing.assert_allclose(data.theta_i[data.mask], 10.0)
     assert np.all(np.abs(np.sin(np.radians(data.phi_o[data.mask]))) < 1e-9)
     assert {"selected: azimuth=0", "held out: incidence=50"} <= set(data.source.notes)
-    said = layerjax("predict result --score data.csv --select incidence=50 azimuth=60").out
-    assert "Prediction of data.csv" in said
+    assert "Prediction of data.csv" in layerjax("predict result --score data.csv --select incidence=50 azimuth=60").out
 
 
 def test_predictions_are_written(work, capsys, coat_fit, layerjax):
     save_fit(coat_fit, "result")
     words = "predict result --incidence 30,70,20 --out new.csv"
     layerjax(words)
-    with (work / "new.csv").open() as file:
-        rows = list(csv.DictReader(file))
-    assert {row["theta_i"] for row in rows} == {"20", "30", "70"}
-    assert len(rows) == 3 * 35
-    for row in rows:
-        intervals = {name: float(row[name]) for name in row if name.startswith(("bsdf", "predictive", "latent"))}
-        assert intervals["predictive_q2.5"] < intervals["bsdf_q50"] < intervals["predictive_q97.5"]
-        assert 0.0 < intervals["bsdf_sd"] < intervals["predictive_sd"]
-        assert intervals["bsdf_mean"] == intervals["latent_mean"]  # no discrepancy is modelled
+    rows = np.genfromtxt(work / "new.csv", delimiter=",", names=True, deletechars="")
+    assert (set(rows["theta_i"]), len(rows)) == ({20.0, 30.0, 70.0}, 3 * 35)
+    columns = ("predictive_q2.5", "bsdf_q50", "predictive_q97.5")
+    assert np.all(np.diff([rows[name] for name in columns], axis=0) > 0.0)
+    assert np.all((rows["bsdf_sd"] > 0.0) & (rows["bsdf_sd"] < rows["predictive_sd"]))
+    assert np.all(rows["bsdf_mean"] == rows["latent_mean"])  # no discrepancy is modelled
     assert "--force" in refused(words.split(), capsys, work)
 
 
@@ -150,22 +132,19 @@ def test_info_says_what_is_there_and_draws_it(work, monkeypatch, layerjax):
     assert "50?" in output
     assert "--force" in output
     assert (work / "data.png").read_bytes() == b"precious"
-
-    names = ",".join(f"brdf_{k}" for k in range(400))
-    rows = [f"30,{theta}," + ",".join(["1"] * 399 + ["2"]) for theta in range(-60, 61, 10)]
-    (work / "spectral.csv").write_text("\n".join([f"theta_i,theta_o,{names}", *rows]))
+    names, cells = (",".join(f"{word}{k}" for k in range(9)) for word in ("brdf_", ""))
+    (work / "spectral.csv").write_text(f"theta_i,theta_o,{names}\n30,10,{cells}\n")
     output = layerjax("info spectral.csv").out
-    assert "0, 1, 2, ..., 399 (400 in all)" in output
-    assert "1 to 2" in output
+    assert "0, 1, 2, ..., 8 (9 in all)" in output
+    assert "0 to 8" in output
 
 
 def test_convert_and_simulate_write_csv(work, coat_data, layerjax):
     layerjax("convert data.csv copy.csv")
     np.testing.assert_array_equal(read(work / "copy.csv").values, coat_data.values)
     layerjax("simulate --stack coat.toml --incidence 20,40 --azimuth 0,90,45 --noise 0.1 --out new.csv --seed 3")
-    first = read(work / "new.csv")
-    assert sorted(set(first.theta_i)) == [20.0, 40.0]
-    assert len(first.wi) == len(slices([20.0, 40.0], azimuth=[0.0, 90.0, 45.0]).wi)
+    first, view = read(work / "new.csv"), slices([20.0, 40.0], azimuth=[0.0, 90.0, 45.0])
+    np.testing.assert_allclose(first.wo, view.wo, atol=1e-9)
     # Lambertian paint alone would be albedo / pi = 0.159; the coat's start values darken it
     assert 0.02 < float(np.median(first.values)) < 0.16
 
@@ -194,30 +173,22 @@ def test_help_and_reading_need_no_jax_whose_alarms_are_not_shown() -> None:
     assert all(flag in done.stdout for flag in flags)
 
 
-def test_a_warning_for_users_is_one_line_and_shown_once(layerjax, monkeypatch):
+def test_a_warning_for_users_is_one_line_and_shown_once(capfd, monkeypatch):
+    """Also one of threads; any other stays what it is."""
+
     def warned(_):
-        for words in ("too narrow", "too narrow", "another"):
-            warnings.warn(words, lj.ResolutionWarning, stacklevel=1)
         warnings.warn("of the program", RuntimeWarning, stacklevel=1)
-        return 0
+        return len(dict(run(tasks.warned, None, range(3)))) - 3
 
     monkeypatch.setitem(commands.COMMANDS, "info", warned)
     with pytest.warns(RuntimeWarning, match="of the program"):
-        said = layerjax("info data.csv").err
-    assert said == "layerjax: warning: too narrow\nlayerjax: warning: another\n"
-
-
-def test_so_is_one_of_threads(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(commands.COMMANDS, "info", lambda _: len(dict(run(tasks.warned, None, range(3)))) - 3)
-    with warnings.catch_warnings():
-        warnings.simplefilter("default")
         assert main(["info", "data.csv"]) == 0
     lines = sorted(capfd.readouterr().err.splitlines())
     assert lines == [f"layerjax: warning: {words}" for words in ("task 0", "task 1", "task 2", "too narrow")]
 
 
 def test_a_fit_of_angles_in_radians_is_doubted(layerjax, work):
-    (work / "data.csv").write_text("theta_i,phi_i,theta_o,phi_o,brdf\n0.5,0,0.3,180,0.1\n0.5,0,0.4,180,0.1\n")
+    (work / "data.csv").write_text("theta_i,theta_o,brdf\n0.5,0.3,0.1\n0.5,0.4,0.1\n")
     with warnings.catch_warnings():
         warnings.simplefilter("default")
         said = layerjax("fit data.csv --stack missing.toml --out result", 2).err

@@ -7,11 +7,10 @@ import numpy as np
 import pytest
 
 import layerjax as lj
-from fits import MapOptions, Noise, SpatialPrior
+from fits import Free, MapOptions, Noise, SpatialPrior
 from fits.cli.parser import main
 from fits.maps.store import FLAGS
 from tests.helpers.commands import refused
-from tests.helpers.map_files import ANGLES, MASK, SIGMA, VALUES
 from tests.helpers.painted_maps import numbers, stored, without
 
 WORDS = ["fit-map", "map.npy", "--geometry", "view.csv", "--stack", "coat.toml", "--out", "coat.zarr"]
@@ -30,10 +29,8 @@ def made(path, failing=0, chunks=None):
 @pytest.fixture
 def place(work):
     """A current directory with a map, its directions, and a stack file."""
-    for name, array in (("map", VALUES), ("sigma", SIGMA), ("mask", MASK)):
-        np.save(work / f"{name}.npy", array)
-    table = np.column_stack(list(ANGLES.values()))
-    np.savetxt(work / "view.csv", table, delimiter=",", header=",".join(ANGLES), comments="")
+    np.save(work / "map.npy", np.ones((5, 1)))
+    (work / "view.csv").write_text("theta_i,phi_i,theta_o,phi_o\n10,180,20,0\n")
     return work
 
 
@@ -72,9 +69,8 @@ def test_defaults_and_options_arrive(place, run):
         "--processes 3 --emulator never --spatial-prior gaussian --spatial-scale 0.1"
     )
     counts = {"starts": 3, "seed": 5, "pilot_texels": 9, "chunk_size": 100, "processes": 3}
-    prior, options = SpatialPrior("gaussian", 0.1), given["options"]
-    assert options.scale.high == 1.2
-    assert replace(options, scale=None) == MapOptions(**counts, emulator=False, force=True, spatial_prior=prior)
+    more = {"emulator": False, "force": True, "spatial_prior": SpatialPrior("gaussian", 0.1)}
+    assert given["options"] == MapOptions(scale=Free(1, 0.8, 1.2), **counts, **more)
     assert (given["sigma"], given["mask"], given["noise"]) == ("sigma.npy", "mask.npy", Noise(0.02, tails="student"))
     _, given = run("--scheduler tcp://10.0.0.1:8786 --emulator always")
     assert given["client"] == "tcp://10.0.0.1:8786"
@@ -90,8 +86,7 @@ def test_what_was_found_is_printed_and_a_map_that_did_not_converge_is_doubtful(r
     assert rows["layers[0].f0"] == ["layers[0].f0", "0.04321", "0.00012", "1"]
     assert "layerjax report coat.zarr" in output.out
     assert "texels 5/10" in output.err
-    for state in ({"failing": 1}, {"failing": 8}, {"chunks": 1}):
-        assert run(**state)[0] == 1
+    assert run(failing=1)[0] == run(chunks=1)[0] == 1
 
 
 @pytest.mark.parametrize(
@@ -99,10 +94,9 @@ def test_what_was_found_is_printed_and_a_map_that_did_not_converge_is_doubtful(r
     [
         ("map.npy=nowhere.npy", "nowhere.npy: no such file"),
         ("map.npy=.", "layerjax fit-many"),
-        ("map.npy=data.csv", "data.csv: a map is one array"),
         ("view.csv=coat.toml", "coat.toml, line"),
-        ("coat.zarr=coat.h5", "coat.h5: a fitted map can be written as .zarr only"),
         ("coat.zarr=file.zarr", "file.zarr: is no store of a fitted map"),
+        ("coat.zarr=coat.h5", "coat.h5: a fitted map can be written as .zarr only"),
         ("--spatial-prior gaussian", "--spatial-prior needs --spatial-scale"),
     ],
 )

@@ -1,26 +1,22 @@
-"""Commands that are interrupted or killed, full disks, and processes that meet: what was kept stays, and is resumed."""
+"""Commands that are interrupted or killed, full disks, and a second process: what was kept stays, and is resumed."""
 
-import signal
-import subprocess
 import sys
-from contextlib import suppress
 from pathlib import Path
 
 import pytest
 
 from fits import save_fit
+from fits._files import locked
 from fits.cli.parser import main
 from fits.optimise import multi_start as starts
 from fits.reports.html import FitReport
-from fits.reports.plots.data import data_picture
 from fits.store import Store
+from tests.fits import kills
 from tests.helpers.coats import make_folder
 from tests.helpers.files import contents, largest_file, read_only
 from tests.helpers.stores import keys
-from tests.helpers.tasks import started, wait_until
 
 FIT = ["fit", "data.csv", "--stack", "coat.toml", "--out", "result"]
-MANY_STARTS = [*FIT, "--starts", "200"]
 FIT_MAP = ["fit-map", "map.npy", "--geometry", "view.csv", "--stack", "coat.toml", "--out", "coat.zarr"]
 FIT_MANY = ["fit-many", "scans", "--stacks", "bare.toml", "--out", "out", "--starts", "2", "--processes", "1"]
 
@@ -37,6 +33,7 @@ def refusal(words, capsys):
 @pytest.mark.parametrize(
     ("place", "words", "hint"),
     [
+        ("fits.batch.fit_file", [*FIT[:-1], "new"], "new was not written; the same command resumes with the starts"),
         ("fits.sampling.sample.sample", ["sample", "result"], "the chain is kept, `layerjax sample result` resumes it"),
         ("fits.batch.fit_one", FIT_MANY, "out keeps what was fitted; the same command resumes it"),
         ("fits.maps.fit_map.fit_map", FIT_MAP, "coat.zarr keeps what was fitted; the same command resumes it"),
@@ -55,23 +52,25 @@ def test_an_interrupt_says_how_to_resume(work, capsys, coat_fit, monkeypatch, pl
     assert (work / "out" / "table.csv").is_file() == (words is FIT_MANY)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("name", kills.COMMANDS)
+def test_a_command_that_is_killed_resumes_with_the_same_result(monkeypatch, name):
+    monkeypatch.setattr(kills, "COMMANDS", {name: kills.COMMANDS[name]})
+    assert kills.main(1) == 0
+
+
 @pytest.mark.parametrize(
     ("words", "name"),
     [
         (["convert", "data.csv", "out.csv", "--force"], "out.csv"),
-        (["simulate", "--stack", "coat.toml", "--out", "out.csv", "--force"], "out.csv"),
-        (["render", "coat.toml", "--out", "out.png", "--force"], "out.png"),
         (["info", "data.csv", "--out", "out.png", "--force"], "out.png"),
         (["report", "one"], "one/report.html"),
         (["sample", "one"], "one/chain.db"),
     ],
-    ids=lambda value: value[0] if isinstance(value, list) else "",
+    ids=["convert", "info", "report", "sample"],
 )
-def test_a_full_disk_is_one_line_and_changes_nothing(work, capsys, coat_fit, words, name, monkeypatch):
-    # any picture will do, and this one is drawn fast
-    monkeypatch.setattr("fits.reports.render.render", lambda *_, **__: data_picture(coat_fit.problem.data))
-    for directory in ("one", "two"):
-        save_fit(coat_fit, directory)
+def test_a_full_disk_is_one_line_and_changes_nothing(work, capsys, coat_fit, words, name):
+    save_fit(coat_fit, "one")
     for output in ("out.csv", "out.png", "one/report.html"):
         (work / output).write_text("precious")
     before = contents(work)
@@ -109,46 +108,12 @@ def test_a_fit_on_a_full_disk_keeps_its_starts_and_the_earlier_result(work, caps
     words = [*FIT, "--starts", "3", "--force"]
     with largest_file(30_000):
         assert refusal(words, capsys) == "layerjax: error: result/report.html: file too large"
-    after = contents(work)
-    after.pop(str(work / ".result.starts"))
+    kept = (work / ".result.starts").read_bytes()
     assert len(keys(Store.read(".result.starts"))) == 3
-    assert after == before
+    with locked(work / ".result.lock", "result"):
+        assert "result is in use by another process" in refusal(words, capsys)
+    assert contents(work) == {**before, str(work / ".result.starts"): kept}
     monkeypatch.setattr(starts, "rough_descent", pytest.fail)  # no start is run again
     monkeypatch.setattr(FitReport, "write", lambda *_: None)
     assert main(words) == 0
     assert not list(work.glob(".*"))
-
-
-def test_an_interrupted_fit_exits_with_130_and_the_next_resumes_with_the_starts_that_are_done(
-    work, capsys, monkeypatch
-):
-    done = work / ".result.starts"
-    with started(["-m", "fits.cli", *MANY_STARTS]) as process:
-        wait_until(lambda: process.poll() is not None or (done.is_file() and len(keys(Store.read(done))) > 2))
-        assert process.poll() is None, "it ended too soon"
-        process.send_signal(signal.SIGSTOP)
-        before = contents(work)
-        assert f"result is in use by another process ({process.pid})" in refusal(MANY_STARTS, capsys)
-        assert contents(work) == before
-        process.send_signal(signal.SIGCONT)
-        error = ""
-        for _ in range(10):  # Python drops one that comes in a callback of the garbage collector
-            process.send_signal(signal.SIGINT)
-            with suppress(subprocess.TimeoutExpired):
-                _, error = process.communicate(timeout=6)
-                break
-    assert process.returncode == 130
-    words = "result was not written; the same command resumes with the starts that are done"
-    assert error.splitlines()[-1] == f"layerjax: interrupted: {words}"
-    assert not (work / "result").exists()
-    kept = len(keys(Store.read(done)))
-    assert 2 < kept < 200
-    solve, solved = starts.rough_descent, []
-    monkeypatch.setattr(starts, "rough_descent", lambda *given, **how: solved.append(how) or solve(*given, **how))
-    monkeypatch.setattr(FitReport, "write", lambda *_: None)
-    assert main(MANY_STARTS) == 0
-    assert solved.count({}) == 200 - kept
-    assert not list(work.glob(".*"))
-    assert main([*MANY_STARTS[:-3], "whole", *MANY_STARTS[-2:]]) == 0
-    for name in ("fit.json", "fitted.toml", "data.csv"):
-        assert (work / "result" / name).read_bytes() == (work / "whole" / name).read_bytes()

@@ -42,14 +42,13 @@ REFUSALS = (
     ("predict saved --incidence 30 --out new.csv --select azimuth=0", "--select is given without --score"),
     ("predict saved --score data.csv --azimuth 90", "--azimuth is given without --incidence"),
     ("render fabrik --out a.png", "neither a .toml file nor a material of the gallery: window_shade"),
-    ("render fabric --out a.jpg", "pictures can be written as .png only"),
     ("fit-many scans", "no stack is given"),
 )
 
 
 @pytest.mark.parametrize(("command", "fragment"), REFUSALS)
 def test_refusals(work, capsys, coat_fit, command, fragment):
-    (work / "bad.csv").write_text("theta_i,phi_i,theta_o,phi_o,brdf\n10,180,twenty,0,0.1\n")
+    (work / "bad.csv").write_text("theta_i,theta_o,brdf\n10,twenty,0.1\n")
     (work / "bad.toml").write_text((work / "coat.toml").read_text().replace("thickness", "thicknes"))
     (work / "root.toml").write_text('objective = "cube_root"\n' + (work / "coat.toml").read_text())
     if "saved" in command:
@@ -76,11 +75,7 @@ MAP, MANY = "fit-map map.npy --stack coat.toml --out coat.zarr", "fit-many scans
         (f"{FIT} --min-retro-angle nan", "nan given, must be a number in [0, 90]"),
         ("simulate --stack coat.toml --incidence 95.5,200 --out x.csv", "200 given, must be a number in [0, 180]"),
         ("simulate --stack coat.toml --azimuth 0,x --out x.csv", "'x' given, must be a number in [-360, 360]"),
-        (
-            "export coat.toml --to rgl --wavelengths 450,1e300 --out x.bsdf",
-            "1e300 given, must be a number in [1, 1e+09]",
-        ),
-        ("simulate --stack coat.toml --out x.csv --noise -1", "-1 given, must be a number in [0, 1]"),
+        ("export coat.toml --to rgl --wavelengths 4,1e300 --out x", "1e300 given, must be a number in [1, 1e+09]"),
         (f"{MANY} --processes 2 --scheduler tcp://x:1", "--scheduler: not allowed with argument --processes"),
         (f"{MAP} --spatial-prior wide", "invalid choice: 'wide'"),
         (f"{MAP} --spatial-scale x", "'x' given, must be a number >= 0"),
@@ -91,11 +86,9 @@ def test_bad_usage(work, capsys, command, fragment):
     with pytest.raises(SystemExit) as stop:
         main(command.split())
     error = capsys.readouterr().err
-    assert stop.value.code == 2
-    assert contents(work) == before
+    assert (stop.value.code, error.count("\n"), contents(work)) == (2, 1, before)
     assert "error: " in error
     assert fragment in error
-    assert error.count("\n") == 1
 
 
 def test_a_cluster_that_is_not_there_is_named(work, capsys):
@@ -107,20 +100,14 @@ def test_a_cluster_that_is_not_there_is_named(work, capsys):
     assert "tcp://127.0.0.1:9: there is no scheduler" in capsys.readouterr().err.splitlines()[-1]
 
 
-@pytest.mark.parametrize(
-    ("error", "fragment"),
-    [
+def test_errors_of_the_machine_are_one_line_and_those_of_the_program_have_their_traceback(work, capsys, monkeypatch):
+    for error, fragment in (
         (MemoryError(), "memory is not enough: MemoryError"),
         (jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of\nmemory"), "enough: RESOURCE_EXHAUSTED: Out of memory"),
         (OverflowError("cannot convert float infinity to integer"), "a number is too large: cannot convert"),
-    ],
-)
-def test_errors_of_the_machine(work, capsys, monkeypatch, error, fragment):
-    monkeypatch.setitem(COMMANDS, "info", Mock(side_effect=error))
-    assert fragment in refused(["info", "data.csv"], capsys, work)
-
-
-def test_an_error_of_the_program_has_its_traceback(work, monkeypatch):
-    monkeypatch.setitem(COMMANDS, "info", lambda _: {}["nothing"])
+    ):
+        monkeypatch.setitem(COMMANDS, "info", Mock(side_effect=error))
+        assert fragment in refused(["info", "data.csv"], capsys, work)
+    monkeypatch.setitem(COMMANDS, "info", Mock(side_effect=KeyError))
     with pytest.raises(KeyError):
         main(["info", "data.csv"])

@@ -1,6 +1,5 @@
 """XML of Radiance's own programs, read as they read it."""
 
-import re
 import subprocess
 import sys
 from pathlib import Path
@@ -36,9 +35,9 @@ def test_radiance_takes_the_azimuths_of_pab_as_we_do(tmp_path):
         peak = direction(theta, 180 + 30)
         value = 0.05 + 2.0 * np.exp(-20 * (1 - geometry.wo @ peak))
         rows = np.stack([geometry.theta_o, geometry.phi_o, value], axis=-1)
-        head = f"#incident_angle {theta} 0\n#format: theta phi BSDF\n#upphi 90\n"
-        body = "\n".join(" ".join(f"{number:.6g}" for number in row) for row in rows)
-        names.append(written(tmp_path, f"{head}{body}\n", f"{theta:g}.dat"))
+        names.append(tmp_path / f"{theta:g}.dat")
+        head = f"#incident_angle {theta} 0\n#format: theta phi BSDF\n#upphi 90"
+        np.savetxt(names[-1], rows, "%.6g", header=head, comments="")
     written(tmp_path, output("pabopto2bsdf", "-s", "i", *names), "a.sir")
     theirs = read(written(tmp_path, output("bsdf2ttree", "-g", "5", tmp_path / "a.sir"), "a.xml"))
     ours = read(tmp_path / "40.dat")
@@ -83,7 +82,6 @@ def test_radiance_finds_the_same_values(tmp_path, rank):
     words = ["-g", "4" if rank == 3 else "3", f"-t{rank}", "+f", "+b", "-e", FUNCTION, "f"]
     path = written(tmp_path, output("bsdf2ttree", *words), "tree.xml")
     data = read(path)
-    assert len(re.findall("WavelengthDataDirection>\\w", path.read_text())) == 4
     sides = data.wi[:, 2] > 0, data.wo[:, 2] > 0
     assert {tuple(pair) for pair in np.transpose(sides)} == {(a, b) for a in (True, False) for b in (True, False)}
 

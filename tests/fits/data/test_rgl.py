@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from fits import Geometry, read, slices
 from fits.data.formats import rgl
@@ -13,24 +14,23 @@ from tests.helpers.data_files import written
 RGB = np.array([0.2, 0.5, 0.8])
 
 
-def lambertian(albedo=RGB, azimuths=None, wavelengths=None):
+def lambertian(azimuths=(0.0,)):
     """A diffuse surface over half vectors drawn in proportion to u, by hand: value = f cos(theta_o) 4 sigma / D."""
     side = np.linspace(0.0, 1.0, 33)
     theta_i = np.radians([0.0, 30.0, 60.0, 80.0])
-    phi_i = np.zeros(1) if azimuths is None else azimuths
+    phi_i = np.array(azimuths)
     warp = np.broadcast_to(np.linspace(0.0, 1.0, 101), (len(phi_i), 4, 2, 101))
     # a density in proportion to u: u^2 is uniform, and so is theta
     phi, theta, phi_m, theta_m = np.meshgrid(phi_i, theta_i, (2 * side - 1) * np.pi, side * np.pi / 2, indexing="ij")
-    turn = phi_m - (0.0 if azimuths is None else phi)
-    facing = np.sin(theta) * np.sin(theta_m) * np.cos(turn) + np.cos(theta) * np.cos(theta_m)
+    facing = np.sin(theta) * np.sin(theta_m) * np.cos(phi_m - phi) + np.cos(theta) * np.cos(theta_m)
     cosine = 2 * facing * np.cos(theta_m) - np.cos(theta)
-    values = np.asarray(albedo)[:, None, None] / np.pi * cosine[:, :, None] * (4 * 0.7) / 1.3
+    values = RGB[:, None, None] / np.pi * cosine[:, :, None] * (4 * 0.7) / 1.3
     ndf, sigma = np.full((2, 8), 1.3), np.full((2, 8), 0.7)
-    return Table(theta_i, phi_i, ndf, sigma, warp, np.ones(cosine.shape), values, wavelengths, "a diffuse surface")
+    return Table(theta_i, phi_i, ndf, sigma, warp, np.ones(cosine.shape), values, None, "a diffuse surface")
 
 
-def diffuse(data, tolerance, albedo=RGB):
-    np.testing.assert_allclose(data.values, np.tile(albedo, (len(data), 1)) / np.pi, rtol=tolerance)
+def diffuse(data, tolerance):
+    np.testing.assert_allclose(data.values, np.tile(RGB / np.pi, (len(data), 1)), rtol=tolerance)
 
 
 @pytest.fixture(scope="module")
@@ -39,12 +39,12 @@ def path(tmp_path_factory):
 
 
 def test_nodes_are_readings(path, monkeypatch):
+    assert table_as_bytes(read_table(path)) == path.read_bytes()
     data = read(path)
     assert data.channels == ("red", "green", "blue")
-    assert (data.source.format, data.source.quantity) == ("rgl", "brdf_cos")
+    assert data.source.quantity == "brdf_cos"
     assert set(data.theta_i.round(3)) == {0.0, 30.0, 60.0, 80.0}
     assert set(data.phi_i[data.theta_i > 0]) == {180.0}
-    assert len(data) > 1000
     diffuse(data, 1e-4)
     assert len(np.unique(np.c_[data.theta_i, data.wo.round(9)], axis=0)) == len(data)  # none twice
     nodes = len(read(path, bins="all"))
@@ -62,36 +62,23 @@ def test_between_nodes_as_renderers_do(path):
     diffuse(data.select(incidence=60), 0.015)
 
 
-def test_spectra_are_channels_by_their_wavelengths(reading):
-    albedo = np.array([0.3, 0.6])
-    data = reading(table_as_bytes(lambertian(albedo, wavelengths=np.array([450.0, 632.8]))))
-    assert data.channels == ("450 nm", "632.8 nm")
-    diffuse(data, 1e-4, albedo)
-
-
 @pytest.mark.parametrize(("last", "turns"), [(np.pi, 1), (0.0, 2), (-np.pi / 2, 4)])
 def test_azimuths_of_a_part_of_the_turn_stand_for_all(reading, last, turns):
     table = lambertian(azimuths=np.linspace(-np.pi, last, 32 // turns + 1))
     assert table.turns == turns
     seen = slices((60,), (-40.0, 20.0, 50.0), azimuth=(0.0, 70.0, 160.0))
-    for turn in np.radians([0.0, 40.0, 130.0, 250.0, 340.0]):
-        cosine, sine = np.cos(turn), np.sin(turn)
-        rotation = np.array([[cosine, sine, 0], [-sine, cosine, 0], [0, 0, 1]])
+    for turn in (0.0, 40.0, 130.0, 250.0, 340.0):
+        rotation = Rotation.from_euler("z", turn, degrees=True)
+        view = Geometry(rotation.apply(np.array(seen.wi)), rotation.apply(np.array(seen.wo)))
         # linear between azimuths 11 degrees apart, twice: 1 % of what may be three times as much as the sum
-        diffuse(reading(table_as_bytes(table), geometry=Geometry(seen.wi @ rotation, seen.wo @ rotation)), 0.03)
+        diffuse(reading(table_as_bytes(table), geometry=view), 0.03)
 
 
-def test_what_is_written_is_read(path):
-    assert table_as_bytes(read_table(path)) == path.read_bytes()
-
-
-@pytest.mark.parametrize(
-    ("name", "change", "message"),
-    [
+def test_what_is_wrong_is_named(path, reading):
+    for name, change, message in (
         ("sigma", None, "no field 'sigma'"),
         ("rgb", None, "no field 'spectra' or 'rgb'"),
         ("rgb", lambda values, fields: fields.update(spectra=values), "no field 'wavelengths'"),
-        ("rgb", lambda values, _: np.where(values == values.max(), np.nan, values), "field 'rgb' holds nan, must be f"),
         ("vndf", lambda values, _: values[:, :2], "field 'vndf' has shape"),
         ("ndf", lambda values, _: values[0], "field 'ndf' has shape"),
         ("theta_i", lambda values, _: values * 2, "field 'theta_i' holds 2.09"),
@@ -99,19 +86,16 @@ def test_what_is_written_is_read(path):
         ("ndf", lambda values, _: -values, "field 'ndf' holds -1.3, must be >= 0"),
         ("sigma", lambda values, _: 0 * values, "field 'sigma' holds 0"),
         ("vndf", lambda values, _: 0 * values, "field 'vndf' is 0 everywhere"),
-    ],
-)
-def test_what_is_wrong_is_named(path, reading, name, change, message):
-    fields = dict(read_fields(path))
-    fields[name] = None if change is None else change(fields[name], fields)
-    fields = {key: value for key, value in fields.items() if value is not None}
-    with pytest.raises(ValueError, match=message):
-        reading(fields_as_bytes(fields))
+    ):
+        fields = dict(read_fields(path))
+        fields[name] = None if change is None else change(fields[name], fields)
+        fields = {key: value for key, value in fields.items() if value is not None}
+        with pytest.raises(ValueError, match=message):
+            reading(fields_as_bytes(fields))
 
 
 def test_bad_arguments(path):
     for given, message in (
-        ({"quantity": "brdf"}, "always holds 'brdf_cos'"),
         ({"geometry": slices(outgoing=(120.0,))}, "at or below the horizon"),
         ({"strata": "flux"}, "lookup and strata apply to MERL files only"),
         ({"geometry": slices(), "bins": 10}, "bins stands beside geometry"),
@@ -127,11 +111,10 @@ SECOND[3, 2:5] = 0.0
 DENSITY = Density(np.stack([FIRST, SECOND]))  # two densities, one of them with rows and cells that are 0
 
 
-@pytest.mark.parametrize("table", [0, 1])
-def test_what_is_drawn_goes_back_to_the_numbers_it_was_drawn_by(table):
+def test_what_is_drawn_goes_back_to_the_numbers_it_was_drawn_by():
     sides = np.linspace(0.0, 1.0, 41)[1:-1]
-    x, y = (drawn[table] for drawn in DENSITY.drawn(sides, sides))
-    only = Interpolation(np.full((x.size, 1), table), np.ones((x.size, 1)))
-    sx, sy, _ = DENSITY.undrawn(x.ravel(), y.ravel(), only)
-    np.testing.assert_allclose(sx.reshape(x.shape), np.tile(sides, (39, 1)), atol=1e-9)
-    np.testing.assert_allclose(sy.reshape(x.shape), np.tile(sides, (39, 1)).T, atol=1e-9)
+    for table, (x, y) in enumerate(zip(*DENSITY.drawn(sides, sides), strict=True)):
+        only = Interpolation(np.full((x.size, 1), table), np.ones((x.size, 1)))
+        sx, sy, _ = DENSITY.undrawn(x.ravel(), y.ravel(), only)
+        expected = np.meshgrid(sides, sides)
+        np.testing.assert_allclose([sx.reshape(x.shape), sy.reshape(x.shape)], expected, atol=1e-9)

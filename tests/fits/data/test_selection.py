@@ -31,9 +31,8 @@ def test_rows_of_one_incidence() -> None:
     """Incidences differ by either angle, and are the same within the jitter of an instrument."""
     theta, phi = [30.24, 30.26, 30.3, 30.74, 0.1, 0.2, 50.0, 50.0], [359.9, 0.1, 0.0, 0.0, 10.0, 200.0, 90.0, 90.6]
     groups = [(0.15, [4, 5]), (30.27, [0, 1, 2]), (30.74, [3]), (50.0, [6]), (50.0, [7])]
-    for group, (polar, rows) in zip(incidences(lying(theta, phi, 5.0, 0.0)), groups, strict=True):
-        assert group.rows.tolist() == rows
-        assert group.theta == pytest.approx(polar, abs=0.005)
+    found = [(round(float(group.theta), 2), group.rows.tolist()) for group in incidences(lying(theta, phi, 5.0, 0.0))]
+    assert found == groups
 
 
 @pytest.mark.parametrize("given", [0.0, 0.8])
@@ -62,15 +61,10 @@ TURNED = np.abs(np.sin(np.radians(DATA.phi_o))) > 0.1
         ("incidence=10,50.2", np.abs(DATA.theta_i - 30.0) > 0.1),
         ("theta_o=20:40", (DATA.theta_o > 19.9) & (DATA.theta_o < 40.1)),
         ("azimuth=60", TURNED),
-        ({"incidence": [10, 50.2]}, np.abs(DATA.theta_i - 30.0) > 0.1),
-        ({"azimuth": 60}, TURNED),
         ({"azimuth": -120}, TURNED),
         ({"in_plane": False}, TURNED),
         ({"theta_o": slice(None, 60)}, DATA.theta_o < 60.5),
-        (
-            {"theta_o": slice(20, 60), "incidence": 10, "in_plane": True},
-            (DATA.theta_o > 19.5) & (DATA.theta_o < 60.5) & (DATA.theta_i < 11.0) & ~TURNED,
-        ),
+        ({"incidence": [10, 50], "in_plane": True}, (np.abs(DATA.theta_i - 30.0) > 0.1) & ~TURNED),
     ],
 )
 def test_words_and_arguments_select_and_drop_omits_the_same(given, expected):
@@ -88,9 +82,7 @@ def test_channels_are_selected():
     values, mask = np.arange(9.0).reshape(3, 3), np.array([True, True, False])
     colours = Measurements(geometry.wi, geometry.wo, values, 0.1 + values, mask, ("red", "green", "blue"))
     both = colours.select(channels=["red", "blue"], theta_o=20)
-    assert both.channels == ("red", "blue")
-    np.testing.assert_array_equal(both.values, [[3.0, 5.0]])
-    np.testing.assert_array_equal(both.sigma, [[3.1, 5.1]])
+    assert (both.channels, both.values.tolist(), both.sigma.tolist()) == (("red", "blue"), [[3.0, 5.0]], [[3.1, 5.1]])
     assert colours.select(channels="green").channels == ("green",)
     np.testing.assert_array_equal(colours.drop(channels="green").values, [[0.0, 2.0], [3.0, 5.0]])
     for given, message in (
@@ -102,9 +94,8 @@ def test_channels_are_selected():
             colours.drop(**given)
 
 
-@pytest.mark.parametrize(
-    ("asked", "message"),
-    [
+def test_refused():
+    for asked, message in (
         ("incidence=35", "incidence 35 is not in the data; there are 10, 30, 50 degrees"),
         ("incidence=10,ten", "incidence is '10,ten'; it must be angles in degrees, as in 10,50 or 20:60"),
         ("theta_o=40:20", "theta_o is 40.0:20.0; it must be two angles, the first not above the second"),
@@ -113,9 +104,7 @@ def test_channels_are_selected():
         ({"azimuth": 90}, "azimuth 90 is not in the data; there are 0, 60 degrees"),
         ({"theta_o": [20, 85]}, "theta_o 85 is not in the data; they go from 0 to 80 degrees"),
         ({"theta_o": slice(81, 85)}, "select: no sample of the data fulfils all of this"),
-    ],
-)
-def test_refused(asked, message):
-    with pytest.raises(ValueError) as refused:  # noqa: PT011 (parentheses in what is looked for)
-        select(DATA, asked) if isinstance(asked, str) else DATA.select(**asked)
-    assert str(refused.value).startswith(message)
+    ):
+        with pytest.raises(ValueError) as refused:  # noqa: PT011 (parentheses in what is looked for)
+            select(DATA, asked) if isinstance(asked, str) else DATA.select(**asked)
+        assert str(refused.value).startswith(message)

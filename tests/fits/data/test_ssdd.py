@@ -89,7 +89,7 @@ def test_blocks_colours_and_binary(reading):
     np.testing.assert_array_equal(np.sign(data.wo[:, 2]), np.repeat([1, -1], 14))
     assert "skipped: specular_reflectance" in data.source.notes
     for wrong, message in (
-        (numbers[0].tobytes()[:3], r"line 9: 3 bytes of data, must be 216 \(truncated\?\)"),
+        (b"abc", r"line 9: 3 bytes of data, must be 216 \(truncated\?\)"),
         ((numbers[0] * np.nan).tobytes(), "line 9: the data hold nan, must be finite"),
     ):
         with pytest.raises(ValueError, match=message):

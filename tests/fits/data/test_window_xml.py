@@ -1,4 +1,4 @@
-"""XML of WINDOW and Radiance: what stands before it, and trees of tensors, boxes and their order by hand.
+"""XML of WINDOW and Radiance: what stands before it, and trees of tensors by hand.
 
 Matrices of WINDOW are read beside what is written, in `tests/fits/exports/test_klems.py`.
 """
@@ -7,8 +7,6 @@ import tracemalloc
 
 import numpy as np
 import pytest
-
-from fits.data.formats.tensor_tree import boxes, disk, look_up, parse
 
 MATRIX = """<?xml version="1.0" encoding="UTF-8"?>
 <WindowElement xmlns="http://windows.lbl.gov"><Optical><Layer><DataDefinition>
@@ -35,11 +33,9 @@ def xml(rank, *blocks):
 
 @pytest.mark.parametrize(("kind", "text"), [("klems", MATRIX), ("tensortree", xml(3, ("{0.25}", {})))])
 def test_what_stands_before_is_no_part_of_it(reading, kind, text):
-    for before in ("", "written by a laboratory\n", "# of <us>\n", "<!-- genBSDF -n 4 -->\n", "\n\n", "\ufeff\n\n"):
-        for encoding in ("utf-8", "utf-16"):
-            data = reading((before + text).encode(encoding))
-            assert data.source.format == kind
-            np.testing.assert_array_equal(data.values, np.full((1, 1), 0.25))
+    for before in ("written by a laboratory\n", "# of <us>\n", "<!-- genBSDF -n 4 -->\n"):
+        data = reading(before + text)
+        assert (data.source.format, data.values.tolist()) == (kind, [[0.25]])
 
 
 def test_rings_stand_for_no_more_patches_than_there_may_be(reading):
@@ -53,61 +49,37 @@ def test_rings_stand_for_no_more_patches_than_there_may_be(reading):
     assert peak < 200e6  # 40 million patches would take a GB
 
 
-EIGHT = "{ {1} {2} {3} {4} {5} {6} {7} { 10 11 12 13 14 15 16 17 } }"
+TREE, FINE = "{ {1} {2} {3} {4} {5} {6} {%s} {8} }", " 10 11 12 13 14 15 16 17 "
 
 
-def test_boxes_by_hand():
-    """The first axis is the lowest bit of a node, and the slowest of a grid."""
-    tree = parse(EIGHT, 3)
-    found = boxes(tree, 3)
-    at = {tuple(low): (edge, value) for low, edge, value in zip(found.low, found.edge, found.values, strict=True)}
-    assert len(at) == 15
-    for low, expected in (
-        ((0.5, 0.0, 0.0), (0.5, 2.0)),
-        ((0.0, 0.5, 0.0), (0.5, 3.0)),
-        ((0.0, 0.0, 0.5), (0.5, 5.0)),
-        ((0.5, 0.5, 0.75), (0.25, 11.0)),
-        ((0.75, 0.5, 0.5), (0.25, 14.0)),
-    ):
-        assert at[low] == expected
-    np.testing.assert_array_equal(look_up(tree, found.low + 0.5 * found.edge[:, None]), found.values)
-
-
-def test_the_disk_has_the_area_of_the_square():
-    """Points on concentric squares land on concentric circles; the map keeps areas."""
-    u, v = np.random.default_rng(0).random((2, 2000))
-    square = np.stack([u, v], axis=-1)
-    np.testing.assert_allclose(np.hypot(*disk(square).T), abs(2 * square - 1).max(axis=1), atol=1e-12)
-    step = 1e-6
-    along, across = np.array([step, 0.0]), np.array([0.0, step])
-    du = (disk(square + along) - disk(square - along)) / (2 * step)
-    dv = (disk(square + across) - disk(square - across)) / (2 * step)
-    area = du[:, 0] * dv[:, 1] - du[:, 1] * dv[:, 0]
-    assert np.median(abs(area - np.pi)) < 1e-6
-    edges = np.array([[1.0, 0.5], [0.5, 1.0], [0.0, 0.5], [0.5, 0.5]])
-    np.testing.assert_allclose(disk(edges), [[1, 0], [0, 1], [-1, 0], [0, 0]], atol=1e-12)
-
-
-def test_an_isotropic_tree_by_hand(reading):
-    data = reading(xml(3, ("{ {1} {0} {3} {0} {5} {0} {7} {0} }", {})))
-    np.testing.assert_allclose(data.theta_i, 30.0)
+@pytest.mark.parametrize("fine", ["7", FINE])
+def test_an_isotropic_tree_by_hand(reading, fine):
+    """The first axis is the lowest bit of a node, and the slowest of a grid; squares become circles."""
+    data = reading(xml(3, (TREE % fine, {})))
     np.testing.assert_allclose(data.phi_i, 180.0)
-    # middles of the quarters of the square are half way out on the diagonals; x ahead of the light, y turned with z
-    assert dict(zip(data.values[:, 0], data.phi_o.round(), strict=True)) == {1.0: 135, 3.0: 45, 5.0: 225, 7.0: 315}
-    np.testing.assert_allclose(data.theta_o, 30.0)
+    angles = np.round([data.theta_i, data.theta_o, data.phi_o], 2).T.tolist()
+    low, high = np.round(np.degrees(np.arcsin([0.25, 0.75])), 2)
+    # x is ahead of the light, y turned with z; along a side of a square azimuths are even
+    expected = {1: [30, 30, 135], 3: [30, 30, 45], 5: [30, 30, 225]} | ({7: [30, 30, 315]} if fine == "7" else {})
+    for first, theta_i in ((10, high), (14, low)) if fine != "7" else ():
+        for place, phi in enumerate((315, 285, 345, 315)):
+            expected[first + place] = [theta_i, high if place else low, phi]
+    assert dict(zip(data.values[:, 0], angles, strict=True)) == expected
 
 
-def test_sides_of_trees(reading):
+def test_sides_and_colours_of_trees(reading):
     sides = [f"{kind} {side}" for kind in ("Reflection", "Transmission") for side in ("Front", "Back")]
     data = reading(xml(4, *(("{0.3}", {"side": side}) for side in sides)))
     np.testing.assert_array_equal(np.sign(data.wi[:, 2]), [1, -1, 1, -1])
     np.testing.assert_array_equal(np.sign(data.wo[:, 2]), [1, -1, -1, 1])
     np.testing.assert_array_equal(data.mask, [True, True, False, False])  # one box: it holds what passes straight
-
-
-def test_colours_of_trees(reading):
-    """u' = 0.1978, v' = 0.4683 are D65: X and Z beside Y are those of the white point."""
-    data = reading(xml(3, (EIGHT, {}), ("{0.19784}", {"colour": "CIE-u"}), ("{0.46834}", {"colour": "CIE-v"})))
+    # u' = 0.1978, v' = 0.4683 are D65: X and Z beside Y are those of the white point
+    tree, v = (TREE % FINE, {}), ("{0.46834}", {"colour": "CIE-v"})
+    data = reading(xml(3, tree, ("{0.19784}", {"colour": "CIE-u"}), v))
     assert data.channels == ("X", "Y", "Z")
     white = np.tile([0.95047, 1, 1.08883], (len(data), 1))
     np.testing.assert_allclose(data.values / data.values[:, 1:2], white, rtol=1e-3)
+    # u' a hundredth of what Y is there: X is 9 u' / 4 v' of it
+    u = "{ {.01} {.02} {.03} {.04} {.05} {.06} { .1 .11 .12 .13 .14 .15 .16 .17 } {.08} }"
+    data = reading(xml(3, tree, (u, {"colour": "CIE-u"}), v))
+    np.testing.assert_allclose(data.values[:, 0], 0.0225 * data.values[:, 1] ** 2 / 0.46834)

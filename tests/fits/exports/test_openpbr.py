@@ -63,16 +63,15 @@ def towards(*degrees):
 
 
 ALL = "coat", "metal", "gloss", "diffuse"
-WHITE = {
-    "rough metal": Surface(("metal",), 1.0, base_metalness=1.0, specular_roughness=0.9),
-    "gloss": Surface(("gloss", "diffuse"), 1.0, specular_roughness=0.35),
-    "all": Surface(ALL, 1.0, 0.3, base_metalness=0.5, coat_roughness=0.5),
-}
 
 
-@pytest.mark.parametrize("name", WHITE)
-def test_a_white_surface_loses_no_light(name):
-    np.testing.assert_allclose(albedo(WHITE[name], towards(0.0, 30.0, 60.0, 80.0)), 1.0, atol=1e-3)
+def test_a_white_surface_loses_no_light():
+    for white in (
+        Surface(("metal",), 1.0, base_metalness=1.0, specular_roughness=0.9),
+        Surface(("gloss", "diffuse"), 1.0, specular_roughness=0.35),
+        Surface(ALL, 1.0, 0.3, base_metalness=0.5, coat_roughness=0.5),
+    ):
+        np.testing.assert_allclose(albedo(white, towards(0.0, 30.0, 60.0, 80.0)), 1.0, atol=1e-3)
 
 
 @pytest.mark.slow
@@ -127,24 +126,6 @@ def test_a_stack_is_found_again(tmp_path, stack, expected, off):
     assert max(medians) < off
 
 
-FIBERS = lj.Medium(1.0, 0.9, lj.SGGX("fiber", 0.5, (1.0, 0.0, 0.0)))
-
-
-@pytest.mark.parametrize(
-    ("stack", "message"),
-    [
-        (lj.Stack([FIBERS], lj.Lambertian(0.3)), "no lobe"),
-        (lj.Stack([lj.Medium(0.7, 0.9)]), "% of the light is transmitted"),
-        (lj.Stack([], lj.Lambertian([0.1, 0.2])), "this stack has 2 channels"),
-    ],
-)
-def test_what_has_no_counterpart_is_refused(tmp_path, stack, message):
-    pytest.importorskip("MaterialX")
-    with pytest.raises(ValueError, match=message):
-        fits.export(stack, tmp_path / "x.mtlx", "openpbr", transport=lj.SingleScattering())
-    assert not list(tmp_path.iterdir())
-
-
 def test_without_the_extra_the_command_says_how_to_install_it(work, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "MaterialX", None)
     said = refused(["export", "coat.toml", "--to", "openpbr", "--out", "coat.mtlx"], capsys, work)
@@ -157,13 +138,10 @@ def test_a_diffuse_stack_is_written_as_it_is_on_the_command_line(work, capsys):
     assert main(["export", "2 red.toml", "--to", "openpbr", "--out", "2 red paint.mtlx"]) == 0
     told = capsys.readouterr()
     assert told.err.startswith("layerjax: diffuse: fit ")
-    said = told.out.splitlines()
-    assert said[0] == "2 red paint.mtlx: 2 red.toml"
-    assert any(note.startswith("Light from 70 degrees: values are off by 0") for note in said)
+    assert told.out.startswith("2 red paint.mtlx: 2 red.toml\n")
+    assert "\nLight from 70 degrees: values are off by 0" in told.out
     found = read(work / "2 red paint.mtlx")
     np.testing.assert_allclose(found["base_color"], RED, atol=1e-5)
     assert found["base_diffuse_roughness"] == pytest.approx(0.0, abs=1e-3)
-    names = ("base_weight", "coat_weight", "specular_weight", "base_metalness")
-    assert [found[name] for name in names] == [1.0, 0.0, 0.0, 0.0]
-    wrong = ["export", "2 red.toml", "--to", "openpbr", "--out", "x.xml"]
-    assert "must end in .mtlx" in refused(wrong, capsys, work)
+    weights = {"base_weight": 1.0, "coat_weight": 0.0, "specular_weight": 0.0, "base_metalness": 0.0}
+    assert weights.items() <= found.items()

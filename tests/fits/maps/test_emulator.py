@@ -28,9 +28,7 @@ def haze(stack, wi, wo):
 
 
 def problem_of(transport):
-    every = fits.slices(incidence=[10.0, 60.0])
-    places = np.linspace(0, len(every.wi) - 1, 12).astype(int)
-    data = along(fits.Geometry(every.wi[places], every.wo[places]), 0.1, channels=("one", "two"))
+    data = along(fits.slices([10.0, 60.0], np.linspace(-80.0, 80.0, 6)), 0.1, channels=("one", "two"))
     return fits.Problem(FREE, data, transport=transport, noise=NOISE, scale=fits.Free(1.0, 0.8, 1.25))
 
 
@@ -53,36 +51,28 @@ def vectors(problem):
     return qmc.scale(points, problem.low, problem.high)
 
 
-def test_values_are_those_of_the_transport_within_a_tenth_of_the_noise(problem, emulated, vectors):
+def test_values_are_those_of_the_transport_within_a_tenth_of_the_noise_or_it_is_too_dear(problem, emulated, vectors):
     for vector in (*vectors, problem.low, problem.high):
         exact, found = (np.asarray(one.predict(vector)) for one in (problem, emulated))
         sigma = np.asarray(problem.call(Model.sigma_at, vector, problem.predict(vector)))
         assert np.max(np.abs(found - exact) / sigma) < 2.0 * ERROR  # at points that no check has seen
+    emulator, words = emulate(problem, fits.MapOptions(emulator_max_solves=10))
+    assert (emulator, "of 10 allowed" in words) == (None, True)
 
 
 def test_derivatives_are_those_of_the_emulator(emulated, vectors):
     """Inside, and on the bounds, where they do not end."""
     predict = jax.jit(lambda vector: emulated.model.predict(vector))
-    slopes_at, step = jax.jit(jax.jacfwd(predict)), 1e-5
-    for vector, inward in ((vectors[7], 0.0), (emulated.low, 1.0), (emulated.high, -1.0)):
+    slopes_at = jax.jit(jax.jacfwd(predict))
+    for vector, step in ((vectors[7], 1e-5), (emulated.low, 1e-5), (emulated.high, -1e-5)):
         vector, slopes = jnp.asarray(vector), np.asarray(slopes_at(jnp.asarray(vector)))
         for place in range(vector.size):
-            ends = (1.0, -1.0) if not inward else (inward, 0.0)
-            moved = [predict(vector.at[place].add(sign * step)) for sign in ends]
-            expected = (moved[0] - moved[1]) / ((ends[0] - ends[1]) * step)
             # differences: rounding of 1e-16 / 1e-5, and a further derivative of about 100 times the step
-            np.testing.assert_allclose(slopes[..., place], expected, rtol=1e-5 if not inward else 2e-2, atol=1e-5)
-    slopes = np.asarray(slopes_at(jnp.asarray(vectors[7])))
+            expected = (predict(vector.at[place].add(step)) - predict(vector)) / step
+            np.testing.assert_allclose(slopes[..., place], expected, rtol=2e-2, atol=1e-5)
     first, second = (emulated.names.index(name) for name in NAMES[1:])  # each channel has its own
-    assert np.all(slopes[:, 0, second] == 0.0)
-    assert np.all(slopes[:, 1, first] == 0.0)
     assert np.any(slopes[:, 0, first] != 0.0)
-
-
-def test_too_dear_an_emulator_is_not_made(problem):
-    emulator, words = emulate(problem, fits.MapOptions(emulator_max_solves=10))
-    assert emulator is None
-    assert "of 10 allowed" in words
+    assert not np.any(slopes[:, [0, 1], [second, first]])
 
 
 def fitted(out, transport, **options):
@@ -111,5 +101,4 @@ def test_an_exact_transport_is_emulated_where_that_pays(tmp_path):
     assert map.numerical_error > 0.0
     for name, truth in zip(NAMES, TRUTH, strict=True):
         assert np.all(np.abs(map.values[name] - truth) < 4.0 * map.errors[name])
-    again = fitted(tmp_path / "coat.zarr", transport, emulator_min_texels=6)
-    assert again.attributes == map.attributes
+    assert fitted(tmp_path / "coat.zarr", transport, emulator_min_texels=6).attributes == map.attributes

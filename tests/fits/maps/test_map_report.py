@@ -15,7 +15,7 @@ from fits.maps import report
 from fits.maps.report import summarise, verdict
 from fits.maps.store import FLAGS, Store
 from tests.helpers.commands import refused
-from tests.helpers.painted_maps import ATTRIBUTES, FREEDOM, GOOD, NAMES, bounded, numbers, stored, without
+from tests.helpers.painted_maps import ATTRIBUTES, GOOD, NAMES, bounded, numbers, stored, without
 
 SHAPE, CHUNK = (20, 30), (10, 10)
 PLACES = np.arange(600).reshape(SHAPE)
@@ -60,14 +60,13 @@ def test_counts_quartiles_and_the_verdict_are_those_of_the_arrays(map, painted):
     root = ET.fromstring(f"<div>{map._repr_html_()}</div>")  # of a notebook
     shown = {row[0].text: [cell.text for cell in row] for row in root.iter("tr")}
     assert tuple(shown["base.albedo"]) == middle["base.albedo"]
-
+    assert [report.share(part, 100_000) for part in (100_000, 99_999, 1)] == ["100 %", "99.99 %", "< 0.01 %"]
     sentences, sound = verdict(numbers, map)
     assert not sound  # 10 of 551 failed
     words = " ".join(sentences)
     for sentence in (
         "A map of 600 texels: 541 are fitted, 29 masked, 20 with too few measurements, 10 failed.",
         "99.26 % of the fitted texels converged.",
-        f"1 ± {np.sqrt(2 / FREEDOM):.2g}",
         "4.62 % of the fitted texels are at a bound.",
         "2.21 % of the fitted texels are poor: chi-square is above 1.6, more than noise",
         "The numerical error of the model is at most 0.025 standard deviations in the pilot.",
@@ -85,12 +84,11 @@ def changed(**arrays):
 
 def flagged(texels, flag, ratio=RATIO):
     """So many texels with this flag and this chi-square."""
-    return changed(
-        flags=np.where(texels > PLACES, flag, GOOD), reduced_chi_square=np.where(texels > PLACES, ratio, RATIO)
-    )
+    where = texels > PLACES
+    return changed(flags=np.where(where, flag, GOOD), reduced_chi_square=np.where(where, ratio, RATIO))
 
 
-SCALED = {factor: changed(reduced_chi_square=factor * RATIO) for factor in (0.3, 1.7, 1e8)}
+SCALED = {factor: changed(reduced_chi_square=factor * RATIO) for factor in (0.3, 1.7)}
 LARGE = ATTRIBUTES["pilot"] | {"poor_above": 1.5e8}
 OFF = {
     "layers[0].ior": {"value": 1.5, "error": 0.1, "unit": "1", "converged": False},
@@ -109,13 +107,11 @@ LEAVE = GOOD | FLAGS["unidentified"]
         (SCALED[0.3], {"noise_assumed": True}, False, ["No noise is stated: 5 %", "less than the assumed noise"]),
         (SCALED[1.7], {"options": {"chi_square_sigmas": 5.0}}, True, []),
         # where nothing explains the chi-squares, no texel is said to be good
-        (SCALED[1e8], {"pilot": LARGE}, False, []),
         (flagged(100, GOOD, 1e8), {"pilot": LARGE}, False, []),
         (flagged(100, GOOD | FLAGS["poor"], 1e8), {}, False, ["16.66 % of the fitted texels are poor"]),
         (changed(reduced_chi_square=np.nan), {}, False, ["No texel has a chi-square: there are no more measurements"]),
         (flagged(30, LEAVE), {}, True, ["of the fitted texels have a parameter that the data leave unidentified"]),
         (flagged(31, LEAVE), {}, False, ["of the fitted texels have a parameter that the data leave unidentified"]),
-        (flagged(31, LEAVE), {"options": {"flagged_share": 0.1}}, True, []),
         (numbers(SHAPE), {"common": OFF}, False, ["joint fit of common parameters has not converged", "mm, common"]),
         (numbers(SHAPE), {"numerical": {"error": 0.2}}, False, ["0.2 standard deviations in the pilot: a finer"]),
         (numbers(SHAPE), {"chunks": 2}, False, ["The map is not finished: 200 of 600 texels (33.33 %) are done"]),
@@ -125,20 +121,14 @@ LEAVE = GOOD | FLAGS["unidentified"]
 def test_the_verdict_is_a_matter_of_its_thresholds(arrays, more, sound, sentences, tmp_path):
     map = stored(tmp_path / "a.zarr", arrays, CHUNK, **more)
     words, is_sound = verdict(summarise(map), map)
-    assert is_sound == sound
-    for sentence in sentences:
-        assert sentence in " ".join(words)
+    assert (is_sound, [one for one in sentences if one not in " ".join(words)]) == (sound, [])
     if more.get("common") is OFF:
         rows = (("layers[0].ior", "1.50", "0.10", "1"), ("layers[0].thickness_mm", "2", "unknown", "mm"))
         assert report.common_table(map).rows == rows
 
 
-def test_nearly_all_is_not_written_as_all():
-    for (part, whole), words in {(7, 7): "100 %", (99_999, 100_000): "99.99 %", (1, 100_000): "< 0.01 %"}.items():
-        assert report.share(part, whole) == words
-
-
-SMOOTHING = {"prior": {"kind": "gaussian", "scale": dict.fromkeys(NAMES, 0.05)}, "rounds": 3, "settled": False}
+PRIOR = {"kind": "gaussian", "scale": dict.fromkeys(NAMES, 0.05)}
+SMOOTHING = {"prior": PRIOR, "rounds": 3, "settled": False, "largest_moves": [3.0, 0.5]}
 ROUNDS = "base.albedo 0.05), in 3 rounds; "
 
 
@@ -154,9 +144,8 @@ def test_maps_in_every_state_are_reported_as_one_whole_file(state, count, words,
     arrays, chunk = (numbers((5, 4, 4)), (5, 4, 4)) if state == "smoothed" else (painted, CHUNK)
     map = stored(tmp_path / "<coat> & co.zarr", arrays, chunk, chunks=0 if state == "empty" else None)
     if state == "smoothed":
-        groups = {f"{group}/{name}": map[f"{group}/{name}"][:] for group in ("values", "errors") for name in NAMES}
-        about = {"smoothing": SMOOTHING | {"largest_moves": [3.0, 0.5]}, "finished": True}
-        Store(map.path).save_group("smoothed", groups, about)
+        groups = {name: map[name][:] for name in map.arrays if "/" in name}
+        Store(map.path).save_group("smoothed", groups, {"smoothing": SMOOTHING, "finished": True})
     fits.report(map, path=tmp_path / "report.html")
     text = (tmp_path / "report.html").read_text()
     captions = re.findall(r'<img alt="([^"]*)" src="data:image/png;base64,[^"]{1000,}">', text)
@@ -170,7 +159,6 @@ def test_maps_in_every_state_are_reported_as_one_whole_file(state, count, words,
     ET.fromstring(re.sub(r"(<img [^>]*[^/])>", r"\1/>", body))  # it is well formed
     text = re.sub(r"base64,[^\"]*", "", text)
     assert "http" not in text
-    assert "<coat>" not in text
     made = ("Noise(relative=0.02)", "poor above 1.6", "kind = &quot;Medium&quot;")
     common = 'layers[0].f0</td><td class="number">0.04321</td><td class="number">0.00012'
     for one in ("Map of &lt;coat&gt; &amp; co.zarr", *made, *([common] if count > 1 else []), *words):
@@ -187,8 +175,7 @@ def test_the_command_writes_the_page_beside_the_store_or_says_why_not(tmp_path, 
     output = layerjax("report a.zarr").out
     assert "No texel is fitted." in output
     assert "Report: a.html" in output
-    layerjax("report a.zarr/ --force")
-    layerjax("report a.zarr --out b.html")
+    layerjax("report a.zarr/ --out b.html")
     assert (tmp_path / "b.html").read_bytes() == (tmp_path / "a.html").read_bytes()
     zarr.create_group(tmp_path / "other.zarr")
     os.truncate(map.path / "flags" / "c" / "0" / "1", 3)
@@ -219,9 +206,7 @@ def test_an_image_is_the_map_with_row_0_on_top_in_colours_over_the_middle():
 
 
 def test_a_texel_is_shown_as_the_gravest_of_its_flags():
-    flags = [0, FLAGS["masked"], FLAGS["too_few_measurements"], FLAGS["failed"] | FLAGS["restarted"]]
-    flags += [FLAGS["fitted"] | FLAGS["poor"], GOOD | FLAGS["poor"] | FLAGS["at_bound"]]
-    flags += [GOOD | FLAGS["unidentified"] | FLAGS["at_bound"], GOOD | FLAGS["at_bound"] | FLAGS["restarted"]]
-    flags += [GOOD | FLAGS["restarted"], GOOD]
-    figure = report.flag_picture(np.array(flags, np.uint16))
+    names = ["", "masked", "too_few_measurements", "failed restarted", "fitted poor", "fitted converged poor at_bound"]
+    names += ["fitted converged " + one for one in ("unidentified at_bound", "at_bound restarted", "restarted", "")]
+    figure = report.flag_picture(np.array([sum(FLAGS[one] for one in each.split()) for each in names], np.uint16))
     np.testing.assert_array_equal(figure.axes[0].images[0].get_array(), [np.arange(10)])

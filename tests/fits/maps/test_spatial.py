@@ -137,7 +137,6 @@ def test_it_ends_where_a_joint_minimisation_does(smoothed, predict, measured, ki
 
 def test_the_plain_fit_stays_and_masked_texels_stay_out(whole, smoothed):
     gaussian = smoothed["gaussian"]
-    assert whole.smoothed is whole.smoothed_errors is whole.smoothing is None
     assert whole.attributes == gaussian.attributes
     for name in whole.arrays:
         np.testing.assert_array_equal(gaussian[name][:], whole[name][:], err_msg=name)
@@ -155,14 +154,9 @@ def test_parameters_that_are_not_named_are_not_smoothed(out, fitted):
 
 
 def test_a_run_that_was_stopped_is_resumed_to_the_bit(out, fitted, smoothed):
-    def stop(stage, done, total=None, info=""):
-        if stage == "smoothing" and done == 2:
-            raise KeyboardInterrupt
-
     with pytest.raises(KeyboardInterrupt):
-        fitted(out, spatial_prior=GAUSSIAN, progress=stop)
-    assert fits.open_map(out).done == 1.0
-    assert fits.open_map(out).smoothed is None
+        fitted(out, spatial_prior=GAUSSIAN, progress=quick_maps.stop_at("smoothing", 2))
+    assert (fits.open_map(out).done, fits.open_map(out).smoothed) == (1.0, None)
     (out / "smoothed.partial" / "values").mkdir(parents=True)  # killed in the midst of the next
     rounds = []
     again = fitted(out, spatial_prior=GAUSSIAN, progress=lambda stage, done, *_: rounds.append((stage, done)))
@@ -187,33 +181,24 @@ def test_another_prior_smooths_anew_and_fits_nothing_again(tmp_path, smoothed, f
     assert_same(again, smoothed["gaussian"])
     assert "pilot" not in stages
     assert {path: path.stat().st_mtime_ns for path in before} == before
-    stages.clear()
-    fitted(out, spatial_prior=GAUSSIAN, progress=lambda stage, *_: stages.append(stage))
-    assert "smoothing" not in stages  # it is there
+    fitted(out, spatial_prior=GAUSSIAN, progress=quick_maps.stop_at("smoothing"))  # it is there
     assert fitted(out).smoothed is not None  # and stays
 
 
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
+def test_scales_are_positive_and_of_parameters_that_there_are(tmp_path, measured):
+    for options, words in (
         ({"scale": {"albedo": 0.1}}, r"names 'albedo'; it must be one of layers\[0\].thickness, base.albedo"),
         ({"objective": "cosine_l2", "stack": quick_maps.FREE}, "objective 'cosine_l2' has no noise"),
         ({"kind": "laplace"}, "SpatialPrior.kind: 'laplace' is not one of 'gaussian', 'total_variation'"),
         ({"scale": 0.0}, r"SpatialPrior.scale is 0.0; it must be a number in \[1e-06, 1e"),
         ({"scale": {"base.albedo": -1.0}}, r"SpatialPrior.scale\['base.albedo'\] is -1.0"),
         ({"scale": {}}, "SpatialPrior.scale is empty"),
-    ],
-)
-def test_invalid_spatial_priors_are_refused(tmp_path, measured, options, words):
-    prior = {"kind": "gaussian", "scale": 0.1} | options
-    more = {name: prior.pop(name) for name in ("objective", "stack") if name in prior}
-    with pytest.raises(ValueError, match=words):
-        quick_maps.fitted(tmp_path / "no.zarr", measured[0], **more, spatial_prior=fits.SpatialPrior(**prior))
-    assert not (tmp_path / "no.zarr").exists()
-
-
-def test_all_channels_of_a_parameter_have_its_scale():
-    names = ["base.albedo[0]", "base.albedo[1]", "layers[0].thickness"]
-    named = fits.SpatialPrior("gaussian", {"base.albedo": 0.1})
-    assert named.scales(names) == {"base.albedo[0]": 0.1, "base.albedo[1]": 0.1}
+    ):
+        prior = {"kind": "gaussian", "scale": 0.1} | options
+        more = {name: prior.pop(name) for name in ("objective", "stack") if name in prior}
+        with pytest.raises(ValueError, match=words):
+            quick_maps.fitted(tmp_path / "no.zarr", measured[0], **more, spatial_prior=fits.SpatialPrior(**prior))
+        assert not (tmp_path / "no.zarr").exists()
+    names = ["base.albedo[0]", "base.albedo[1]", "layers[0].thickness"]  # all channels of a parameter have its scale
+    assert fits.SpatialPrior("gaussian", {"base.albedo": 0.1}).scales(names) == dict.fromkeys(names[:2], 0.1)
     assert fits.SpatialPrior("gaussian", 0.2).scales(names) == dict.fromkeys(names, 0.2)
