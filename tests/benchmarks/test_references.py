@@ -37,11 +37,24 @@ def test_a_fit_and_its_posterior_are_timed() -> None:
 
 
 def test_a_fit_has_a_row_cold_one_warm_and_one_of_its_posterior() -> None:
-    found = {"cold": 20.0, "warm": 0.4, "sample": 70.0, "effective": 1200.0, "evaluations": 5e3, "acceptance": 0.9}
+    found = {"cold": 8.0, "warm": 0.4, "sample": 70.0, "effective": 1200.0, "evaluations": 5e3, "acceptance": 0.9}
     rows = speed.cold_rows("fit", found, WORK)
-    assert [(row.measured, row.verdict) for row in rows] == [(20.0, "met"), (0.4, "aim met"), (70.0, "**not met**")]
+    assert [(row.measured, row.verdict) for row in rows] == [(8.0, "met"), (0.4, "aim met"), (70.0, "**not met**")]
     assert "2 starts" in rows[0].what
     assert rows[2].what.startswith("50 effective samples")
+
+
+def test_first_and_later_calls_have_a_row_each() -> None:
+    found = {"seconds": 1.5, "second": 0.9, "later": 3e-3, "next": 0.3, "statistical": 1e-3}
+    rows = speed.cold_rows("evaluate", found, WORK)
+    assert [(row.measured, row.unit, row.verdict) for row in rows] == [
+        (1.5, "s", "met"),
+        (0.9, "s", "met"),
+        (0.3, "s", "aim met"),
+        (3.0, "ms", "**not met**"),
+        (1.0, "ms", "aim met"),
+    ]
+    assert [row.measured for row in speed.cold_rows("grad", found, WORK)] == [1.5, 0.9, 3.0]
 
 
 def test_what_is_less_exact_than_asked_for_meets_no_bar() -> None:

@@ -1,12 +1,14 @@
-"""Seconds that a fresh process waits: each compiles all that it runs, no program is kept from one to another."""
+"""Seconds that a fresh process waits: each compiles all that it runs, unless it has a folder of cached programs."""
 
 import json
 import os
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -25,6 +27,7 @@ Program = Callable[[Array], Any]
 
 ROOT = Path(__file__).parents[3]
 NOISE = 0.05
+WARM_CALLS = 20
 
 
 @dataclass(frozen=True)
@@ -42,14 +45,20 @@ class Work:
         return lj.AddingDoubling(nodes=self.nodes, modes=self.modes, orders=self.orders)
 
 
-def fresh(what: What, work: Work) -> dict[str, float]:
-    """Measure it in a process of its own."""
+def fresh(what: What, work: Work, cache: str = "") -> dict[str, float]:
+    """Measure it in a process of its own. cache: folder in which it keeps programs; none if empty."""
     environment = {name: value for name, value in os.environ.items() if name != "JAX_COMPILATION_CACHE_DIR"}
     program = f"import sys; from {__name__} import main; main(sys.argv[1:])"
-    command = [sys.executable, "-c", program, what, json.dumps(asdict(work)), str(time.time())]
+    command = [sys.executable, "-c", program, what, json.dumps(asdict(work)), str(time.time()), cache]
     ended = subprocess.run(command, cwd=ROOT, env=environment, stdout=subprocess.PIPE, text=True, check=True)
     results: dict[str, float] = json.loads(ended.stdout)
     return results
+
+
+def second(what: What, work: Work) -> float:
+    """Seconds of the first call in a second process, which finds the programs of the one before."""
+    with tempfile.TemporaryDirectory() as cache:
+        return [fresh(what, work, cache)["seconds"] for _ in range(2)][1]
 
 
 def programs(transport: lj.Transport) -> dict[str, Program]:
@@ -64,10 +73,11 @@ def programs(transport: lj.Transport) -> dict[str, Program]:
         values = value(p)
         return values, values
 
+    jit = partial(jax.jit, compiler_options=lj.compiler_options() or None)
     return {
-        "value": jax.jit(value),
-        "jacobian": jax.jit(jax.jacfwd(twice, has_aux=True)),
-        "gradient": jax.jit(jax.value_and_grad(lambda p: (value(p) ** 2).sum())),
+        "value": jit(value),
+        "jacobian": jit(jax.jacfwd(twice, has_aux=True)),
+        "gradient": jit(jax.value_and_grad(lambda p: (value(p) ** 2).sum())),
     }
 
 
@@ -80,15 +90,25 @@ def compiling(what: str, transport: lj.Transport) -> dict[str, float]:
 
 
 def first_call(what: str) -> dict[str, float]:
-    """Seconds of the first `evaluate`, or the first gradient of it, of the coat in the README, as it stands there."""
-    coat = lj.Stack(
-        [lj.Interface(ior=1.5, alpha=0.1), lj.Medium(thickness=1.0, albedo=0.9, phase=lj.HenyeyGreenstein(0.6))],
-        lj.Lambertian(albedo=[0.8, 0.4, 0.2]),
-    )
+    """Seconds of the first `evaluate`, or the first gradient of it, of the coat in the README, as it stands there; and
+    of later calls, un-jitted. Of values also those of the next stack, which has one medium more, and by `Statistical`.
+    """
+    top, haze = lj.Interface(ior=1.5, alpha=0.1), lj.Medium(thickness=1.0, albedo=0.9, phase=lj.HenyeyGreenstein(0.6))
+    coat = lj.Stack([top, haze], lj.Lambertian(albedo=[0.8, 0.4, 0.2]))
+    dyed = lj.Stack([top, haze, lj.Medium(thickness=0.5, albedo=0.0)], coat.base)
     wi, wo = lj.direction(0.5, 0.0), lj.direction(np.array([0.3, 0.6]), 3.1)
-    if what == "evaluate":
-        return {"seconds": _seconds(lambda: lj.evaluate(coat, wi, wo))}
-    return {"seconds": _seconds(lambda: jax.grad(lambda stack: lj.evaluate(stack, wi, wo).sum())(coat))}
+    if what == "grad":
+        gradient = jax.grad(lambda stack: lj.evaluate(stack, wi, wo).sum())
+        return _first_and_later(lambda: gradient(coat))
+    found = _first_and_later(lambda: lj.evaluate(coat, wi, wo))
+    found["next"] = _seconds(lambda: lj.evaluate(dyed, wi, wo))
+    return found | {"statistical": _first_and_later(lambda: lj.evaluate(coat, wi, wo, lj.Statistical()))["later"]}
+
+
+def _first_and_later(work: Callable[[], Any]) -> dict[str, float]:
+    """Seconds of the first call, and the median of later ones."""
+    first, *later = [_seconds(work) for _ in range(1 + WARM_CALLS)]
+    return {"seconds": first, "later": float(np.median(later))}
 
 
 def fitting(work: Work, began: float) -> dict[str, float]:
@@ -126,10 +146,14 @@ def _seconds(work: Callable[[], Any]) -> float:
 
 
 def main(arguments: list[str]) -> None:
-    """Measure one thing, and print it: WHAT, the work as JSON, and when the process was started, of the epoch."""
+    """Measure one thing, and print it: WHAT, the work as JSON, when the process was started, of the epoch, and the
+    folder in which programs are cached, or nothing."""
+    what, settings, began, cache = arguments
     jax.config.update("jax_enable_x64", True)
-    jax.config.update("jax_enable_compilation_cache", False)
-    what, settings, began = arguments
+    jax.config.update("jax_enable_compilation_cache", bool(cache))
+    if cache:
+        os.environ["XDG_CACHE_HOME"] = cache
+        lj.keep_programs()
     work = Work(**json.loads(settings))
     if what == "fit":
         found = fitting(work, float(began))

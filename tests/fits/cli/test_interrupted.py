@@ -11,7 +11,7 @@ from fits.cli.parser import main
 from fits.optimise import multi_start as starts
 from fits.reports.html import FitReport
 from fits.store import Store
-from tests.fits import kills
+from tests.helpers import kills
 from tests.helpers.coats import make_folder
 from tests.helpers.files import contents, largest_file, read_only
 from tests.helpers.stores import keys

@@ -232,7 +232,7 @@ def test_what_stands_in_masked_texels_is_not_looked_at(tmp_path, measured, whole
     np.testing.assert_array_equal(without.errors[NAMES[1]], whole.errors[NAMES[1]])
 
 
-# ---- work that is interrupted or damaged (kills: `tests.fits.kills`) ----
+# ---- work that is interrupted or damaged (kills: `tests.helpers.kills`) ----
 
 
 @pytest.mark.parametrize("chunks", [0, 2])

@@ -1,4 +1,4 @@
-"""Commands killed at random moments and run again: `python -m tests.fits.kills [TIMES] [DIR]` says how many resumed.
+"""Commands killed at random moments and run again: `python -m tests.helpers.kills [TIMES] [DIR]` says how many resumed.
 
 Each command runs once undisturbed, then so many times more (10), killed at a moment drawn from the time that the first
 took and run again until it ends. What it leaves is the same then, to the last digit: all but seconds.
