@@ -44,7 +44,7 @@ def test_what_is_cut_off_counts():
 @pytest.mark.parametrize("part", range(4))
 @pytest.mark.parametrize("kind", STRUCTURES)
 def test_errors_cover_random_stacks(kind, part):
-    """140 stacks, of which 99.7 % of the pairs lie within four errors: 99 % of any part, and all within 8."""
+    """Of 140 stacks: in any part 99 % of the pairs lie within four errors, and all within 8."""
     found = []
     for seed in range(100 + part, 120, 4):
         stack = STRUCTURES[kind][1](drawn(kind, seed))

@@ -37,14 +37,13 @@ def extreme_stack(kind, generator):
 
     if kind == "media":
         return Stack([haze(), flakes(None)], lj.OrenNayar(edge(generator, 0.0, 1.0), edge(generator, 0.0, 1.0)))
-    if kind == "face":
-        return Stack([face(), haze()])
+    if kind == "faces":
+        return Stack([face(), haze(), face()])
     if kind == "metal":
         return Stack(
-            [flakes((1.0, 0.0, 0.0)), flakes((0.3, 0.2, 0.9))],
-            lj.Conductor(0.2, edge(generator, 0.0, 20.0), 10.0 ** edge(generator, -4.0, 0.0)),
+            [haze(), face()], lj.Conductor(0.2, edge(generator, 0.0, 20.0), 10.0 ** edge(generator, -4.0, 0.0))
         )
-    raise ValueError(kind)
+    return Stack([flakes((1.0, 0.0, 0.0)), haze(), flakes((0.3, 0.2, 0.9))])
 
 
 @pytest.mark.slow
@@ -82,9 +81,11 @@ def test_elements_are_differentiated_by_directions_too():
 @pytest.mark.parametrize(
     ("kind", "dtype"),
     [
-        ("face", "float32"),
+        ("faces", "float32"),
         ("metal", "float64"),
+        ("tilted", "float32"),
         ("media", "float32"),
+        ("media", "float64"),
     ],
 )
 def test_finite_over_the_box(kind, dtype):
