@@ -3,6 +3,8 @@
 Arguments broadcast against each other; a reflectance has their common shape and lies in [0, 1].
 """
 
+import math
+
 import jax.numpy as jnp
 from jax import Array
 
@@ -12,6 +14,11 @@ from layerjax.directions import squared_cosine_of_refraction
 ROUNDED_ROOT = (308 / 1536, 1080 / 1536, 924 / 1536, -432 / 1536, -660 / 1536, 120 / 1536, 196 / 1536)
 """Coefficients of r^0 ... r^6 of what stands for the root of r on (-1, 1): with its value and two derivatives at 1, all
 three 0 at -1, and with its mean."""
+
+SERIES = 9
+"""Terms of cos and sinc as series in the squared phase, where that is below 1/2: to 1e-16."""
+COSINE = tuple((-1.0) ** k / math.factorial(2 * k) for k in range(SERIES))
+SINC = tuple((-1.0) ** k / math.factorial(2 * k + 1) for k in range(SERIES))
 
 
 def schlick(cosine: Array, f0: Array | float) -> Array:
@@ -91,3 +98,54 @@ def conductor(cosine: Array, ior: Array, k: Array) -> Array:
     perpendicular, below = (a - cosine) ** 2 + b2, (a + cosine) ** 2 + b2
     ratio, under = (a * cosine - sin2) ** 2 + b2 * cos2, (a * cosine + sin2) ** 2 + b2 * cos2
     return safe_div(0.5 * perpendicular * (under + ratio), below * under)  # one division for both polarisations
+
+
+def thin_film(cosine: Array, ior: Array, k: Array | float, film_ior: Array, phase: Array) -> Array:
+    """Reflectance of a coherent film on a dielectric or conductor: all reflections within it, both polarisations.
+
+    By the film's characteristic matrix (Abeles 1950; Born & Wolf, Principles of Optics, 1.6), whose elements are smooth
+    functions of the squared cosine in the film, also through its critical angle; with phase = 0 as without the film.
+
+    Args:
+        cosine: cosine between the direction of incidence and the facet normal, in [0, 1].
+        ior, k: index ior + i k of what lies below the film, relative to the medium above it, as of `conductor`.
+        film_ior: index of the film relative to the medium above it, > 0.
+        phase: 2 pi thickness / wavelength in the medium above, >= 0.
+    """
+    u, v = _normal_component(cosine, ior, k)  # q3, the normal component of the wave vector below
+    q2 = (film_ior - 1.0) * (film_ior + 1.0) + cosine * cosine  # the squared one in the film
+    c, s = _cos_and_sinc(phase * phase * q2)
+    s = phase * s
+    # fields at the top for q3 at the bottom, each r = (q1 E - H) / (q1 E + H) or, of the parallel one, (E - q1 H) / ...
+    real, imaginary = ior * ior - k * k, 2.0 * ior * k
+    a, b = s * q2 / (film_ior * film_ior), s * film_ior * film_ior
+    perpendicular = _energy(cosine * (c + s * v), -cosine * s * u, c * u, c * v - s * q2)
+    parallel = _energy(
+        c * u + a * imaginary, c * v - a * real, cosine * (c * real + b * v), cosine * (c * imaginary - b * u)
+    )
+    return clamp_max(0.5 * (perpendicular + parallel), 1.0)
+
+
+def _energy(er: Array, ei: Array, hr: Array, hi: Array) -> Array:
+    """|E - H|^2 / |E + H|^2."""
+    return safe_div((er - hr) ** 2 + (ei - hi) ** 2, (er + hr) ** 2 + (ei + hi) ** 2)
+
+
+def _normal_component(cosine: Array, ior: Array, k: Array | float) -> tuple[Array, Array]:
+    """Real and imaginary part of the root of (ior + i k)^2 - sin^2, both >= 0: see `conductor`."""
+    product = ior * k
+    real = (ior - 1.0) * (ior + 1.0) - k * k + cosine * cosine
+    larger = safe_sqrt(0.5 * (safe_sqrt(real * real + 4.0 * product * product) + jnp.abs(real)))
+    smaller = safe_div(product, larger)
+    return jnp.where(real > 0, larger, smaller), jnp.where(real > 0, smaller, larger)
+
+
+def _cos_and_sinc(squared: Array) -> tuple[Array, Array]:
+    """cos(x) and sin(x) / x of a squared x; of a negative one cosh and sinh, both divided by a common large factor."""
+    small = jnp.abs(squared) < 0.5
+    x = jnp.sqrt(jnp.where(small, 1.0, jnp.abs(squared)))
+    decayed = jnp.exp(-2.0 * x)
+    cosine = jnp.where(squared > 0, jnp.cos(x), 0.5 * (1.0 + decayed))
+    sinc = jnp.where(squared > 0, jnp.sin(x), 0.5 * (1.0 - decayed)) / x
+    near = jnp.where(small, squared, 0.0)
+    return jnp.where(small, horner(COSINE, near), cosine), jnp.where(small, horner(SINC, near), sinc)
