@@ -12,6 +12,9 @@ from layerjax.evaluate import pdf as pdf
 from layerjax.evaluate import sample as sample
 from layerjax.evaluate import unscattered as unscattered
 from layerjax.mixture import Mixture as Mixture
+from layerjax.optical_constants import cauchy as cauchy
+from layerjax.optical_constants import metal as metal
+from layerjax.optical_constants import sellmeier as sellmeier
 from layerjax.phase import SGGX as SGGX
 from layerjax.phase import HenyeyGreenstein as HenyeyGreenstein
 from layerjax.phase import PhaseFunction as PhaseFunction
@@ -26,6 +29,7 @@ from layerjax.stack import TurbidMedium as TurbidMedium
 from layerjax.surfaces import Conductor as Conductor
 from layerjax.surfaces import Lambertian as Lambertian
 from layerjax.surfaces import OrenNayar as OrenNayar
+from layerjax.surfaces import ThinFilm as ThinFilm
 from layerjax.surfaces import VMFDiffuse as VMFDiffuse
 from layerjax.transport import ENDF as ENDF
 from layerjax.transport import AddingDoubling as AddingDoubling

@@ -35,6 +35,9 @@ RANGES: dict[str, tuple[float, float]] = {
     "Conductor.k": (0.0, 20.0),
     "Conductor.alpha": (1e-4, 1.0),
     "Conductor.alpha, vmf": (1e-4, 15.0),
+    "ThinFilm.ior": (0.25, 4.0),
+    "ThinFilm.thickness_nm": (0.0, 5000.0),
+    "ThinFilm.wavelengths_nm": (100.0, 1e5),
 }
 """The documented box: the range of every numeric field; of widths, for every distribution of normals."""
 
@@ -51,6 +54,8 @@ PER_CHANNEL = frozenset(
         "VMFDiffuse.albedo",
         "Conductor.ior",
         "Conductor.k",
+        "ThinFilm.ior",
+        "ThinFilm.wavelengths_nm",
     }
 )
 """Fields that take a value a channel, shape (C,), as well as one for all, shape (). Maps: see `layerjax._shapes`."""

@@ -15,6 +15,8 @@ from jax.typing import ArrayLike
 from numpy.typing import NDArray
 
 from layerjax import tables
+from layerjax._checks import abbreviate
+from layerjax._parameters import as_floating
 
 RGB_NM = (610.0, 550.0, 465.0)
 """Wavelengths that stand for red, green and blue."""
@@ -43,17 +45,19 @@ def metal(name: str, wavelengths_nm: ArrayLike | Literal["rgb"]) -> tuple[NDArra
         (3,)
     """
     table = _metals()
-    if name not in table:
-        raise ValueError(f"metal: {name!r} is not one of {', '.join(table)}")
+    if not isinstance(name, str) or name not in table:
+        raise ValueError(f"metal: the name {abbreviate(name)} is not one of {', '.join(table)}")
     known, n, k = table[name]
-    asked = np.atleast_1d(np.asarray(RGB_NM if isinstance(wavelengths_nm, str) else wavelengths_nm, float))
     if isinstance(wavelengths_nm, str) and wavelengths_nm != "rgb":
         raise ValueError(f'wavelengths_nm: {wavelengths_nm!r} is neither numbers nor "rgb"')
-    if not np.all((asked >= known[0]) & (asked <= known[-1])):
+    given = RGB_NM if isinstance(wavelengths_nm, str) else as_floating("wavelengths_nm", wavelengths_nm)
+    wanted = np.atleast_1d(np.asarray(given, float))
+    if not np.all((wanted >= known[0]) & (wanted <= known[-1])):
+        outside = wanted[(wanted < known[0]) | (wanted > known[-1]) | np.isnan(wanted)][0]
         raise ValueError(
-            f"wavelengths_nm: {asked} lie not all within the table of {name}, {known[0]:g} to {known[-1]:g}"
+            f"wavelengths_nm: {outside:g} is outside the table of {name}, {known[0]:.1f} to {known[-1]:.1f} nm"
         )
-    return np.interp(asked, known, n), np.interp(asked, known, k)
+    return np.interp(wanted, known, n), np.interp(wanted, known, k)
 
 
 def cauchy(wavelengths_nm: ArrayLike, a: ArrayLike, b: ArrayLike, c: ArrayLike = 0.0) -> Array:
@@ -69,8 +73,8 @@ def cauchy(wavelengths_nm: ArrayLike, a: ArrayLike, b: ArrayLike, c: ArrayLike =
         >>> import layerjax as lj
         >>> lj.cauchy([610.0, 550.0, 465.0], 1.4787, 0.00455).round(4).tolist()  # acrylic: n_D 1.492, Abbe number 57
     """
-    square = (jnp.asarray(wavelengths_nm) * 1e-3) ** 2
-    return a + b / square + c / (square * square)
+    square = (as_floating("wavelengths_nm", wavelengths_nm) * 1e-3) ** 2
+    return as_floating("a", a) + as_floating("b", b) / square + as_floating("c", c) / (square * square)
 
 
 def sellmeier(wavelengths_nm: ArrayLike, b: ArrayLike, c: ArrayLike) -> Array:
@@ -86,8 +90,8 @@ def sellmeier(wavelengths_nm: ArrayLike, b: ArrayLike, c: ArrayLike) -> Array:
         >>> round(float(lj.sellmeier([587.56], b, c)[0]), 4)  # N-BK7 (Schott)
         1.5168
     """
-    square = (jnp.asarray(wavelengths_nm)[..., None] * 1e-3) ** 2
-    return jnp.sqrt(1.0 + jnp.sum(jnp.asarray(b) * square / (square - jnp.asarray(c)), axis=-1))
+    square = (as_floating("wavelengths_nm", wavelengths_nm)[..., None] * 1e-3) ** 2
+    return jnp.sqrt(1.0 + jnp.sum(as_floating("b", b) * square / (square - as_floating("c", c)), axis=-1))
 
 
 @cache

@@ -22,7 +22,7 @@ from layerjax.channels import Channels, per_channel
 from layerjax.directions import Vector
 from layerjax.normals.facets import Distribution, check_facets
 from layerjax.phase import HenyeyGreenstein, PhaseFunction
-from layerjax.surfaces import Surface
+from layerjax.surfaces import Conductor, Surface
 
 LEAST_EXTINCTION = 1e-10
 """In 1/mm, stands for 0 where derivatives by the coefficients of a turbid medium may be needed."""
@@ -194,8 +194,8 @@ def require_numbers(stack: Any) -> None:
 def simplify(stack: Stack) -> Stack:
     """The same stack without what its concrete values say is not there.
 
-    Turbid media become media. Media of thickness 0 go, and interfaces whose index is that of what lies above them (all
-    light passes); f0 = 1 becomes None; f0 = 0 and albedo = 0 or 1 become Python floats, known while tracing.
+    Turbid media become media. Media and films of thickness 0 go, and interfaces whose index is that of what lies above
+    them (all light passes); f0 = 1 becomes None; f0 = 0 and albedo = 0 or 1 become Python floats, known while tracing.
     Axes of media that are the normal go: what is symmetric about it is so by structure.
     Traced values are kept as they are, so derivatives with respect to them are exact.
     """
@@ -221,6 +221,9 @@ def simplify_and_name(stack: Stack) -> tuple[Stack, tuple[str, ...]]:
                 layer = eqx.tree_at(lambda medium: medium.f0, layer, None)
         layers.append(layer)
         names.append(f"layers[{index}]")
+    base = stack.base
+    if isinstance(base, Conductor) and base.film is not None and _is_everywhere(base.film.thickness_nm, 0.0):
+        stack = eqx.tree_at(lambda s: s.base.film, stack, None)
     return eqx.tree_at(lambda s: s.layers, stack, tuple(layers)), tuple(names)
 
 

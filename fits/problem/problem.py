@@ -49,6 +49,8 @@ UNITS = {
     "noise.discrepancy.length_difference": "deg",
     "thickness": "optical depth",
     "thickness_mm": "mm",
+    "thickness_nm": "nm",
+    "wavelengths_nm": "nm",
     "mu_s": "1/mm",
     "mu_a": "1/mm",
 }

@@ -245,6 +245,8 @@ def _make(where: str, kind: type, table: Any) -> Any:
 def _value(where: str, key: str, value: Any) -> Any:
     """What stands at a key: a number, a word, a list, a part with a `kind`, or something that is free."""
     if isinstance(value, dict):
+        if key == "film":
+            return _make(where, lj.ThinFilm, value)
         if key in _PARTS or "kind" in value:
             return _build(where, value, _PARTS.get(key, _LAWS))
         return _make(where, Discrepancy if key == "discrepancy" else Free, value)
@@ -336,6 +338,8 @@ def _to_plain(value: Any) -> Any:
         return changed or (True if isinstance(value, Discrepancy) else {})
     if isinstance(value, lj.PhaseFunction | Prior | PowerLaw):
         return _module_to_dict(value)
+    if isinstance(value, lj.ThinFilm):
+        return {field.name: _to_plain(getattr(value, field.name)) for field in fields(value)}
     array = np.asarray(value)
     if array.dtype.kind == "i":
         return array.tolist()

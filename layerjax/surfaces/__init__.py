@@ -9,4 +9,5 @@ from layerjax.surfaces.contract import Surface as Surface
 from layerjax.surfaces.lambertian import Lambertian as Lambertian
 from layerjax.surfaces.microfacet import Conductor as Conductor
 from layerjax.surfaces.oren_nayar import OrenNayar as OrenNayar
+from layerjax.surfaces.thin_film import ThinFilm as ThinFilm
 from layerjax.surfaces.vmf_diffuse import VMFDiffuse as VMFDiffuse

@@ -1,16 +1,20 @@
 """Rough conductors of microfacets: single scattering, separable Smith masking (Walter et al. 2007)."""
 
+from typing import Any
+
 import equinox as eqx
 from jax import Array
 
 from layerjax import fresnel
+from layerjax._checks import require_kind
 from layerjax._parameters import Parameter, parameter
-from layerjax.channels import map_channels, per_channel
+from layerjax.channels import Channels, map_channels, per_channel
 from layerjax.directions import Vector, half_vector, reflect
 from layerjax.normals import facets
 from layerjax.normals.facets import Distribution, check_facets, reflection_pdf
 from layerjax.quadrature import Nodes
 from layerjax.surfaces.contract import Surface
+from layerjax.surfaces.thin_film import ThinFilm
 
 
 class Conductor(Surface):
@@ -26,6 +30,8 @@ class Conductor(Surface):
     alpha        alpha  ()       1    [1e-4, 1]    required yes            width of D; [1e-4, 15] for ``"vmf"``, where
                                                                            kappa = 2 / alpha^2
     distribution D                    "ggx", "vmf" "ggx"    no             GGX or von Mises-Fisher, as of an `Interface`
+    film                              `ThinFilm`   None     yes            transparent film on every facet; not in
+                                                                           `Statistical` and `ENDF`
     ============ ====== ======== ==== ============ ======== ============== =============================================
     """
 
@@ -33,15 +39,32 @@ class Conductor(Surface):
     k: Parameter = parameter("Conductor.k")
     alpha: Parameter = parameter("Conductor.alpha", ranged=False)
     distribution: Distribution = eqx.field(static=True, default="ggx")
+    film: ThinFilm | None = None
 
     def __check_init__(self) -> None:
         check_facets("Conductor", self.distribution, self.alpha)
+        require_kind("Conductor.film", self.film, ThinFilm, None)
+
+    def reflectance(self, cosine: Array) -> Channels:
+        """Fresnel reflectance of a facet, by the cosine of incidence on it."""
+        ior, k = per_channel(self.ior), per_channel(self.k)
+        if self.film is None:
+            return map_channels(lambda ior, k: fresnel.conductor(cosine, ior, k), ior, k)
+        film = per_channel(self.film.ior), per_channel(self.film.phase)
+        return map_channels(lambda *numbers: fresnel.thin_film(cosine, *numbers), ior, k, *film)
+
+    def relative_to(self, above: Any) -> "Conductor":
+        """The same conductor, its indices and wavelengths counted in a medium of this index that lies on it."""
+        relative = eqx.tree_at(lambda base: (base.ior, base.k), self, (self.ior / above, self.k / above))
+        if self.film is None:
+            return relative
+        film = self.film.ior / above, self.film.thickness_nm * above
+        return eqx.tree_at(lambda base: (base.film.ior, base.film.thickness_nm), relative, film)
 
     def evaluate(self, wi: Vector, wo: Vector) -> tuple[Array, ...]:
         h, cosine = half_vector(wi, wo, same_side=True)
         lobe = mirror_lobe(h, wi, wo, self.alpha, self.distribution)
-        ior, k = per_channel(self.ior), per_channel(self.k)
-        return map_channels(lambda ior, k: lobe * fresnel.conductor(cosine, ior, k), ior, k)
+        return tuple(lobe * level for level in self.reflectance(cosine))
 
     def sample(self, wi: Vector, u1: Array, u2: Array) -> Vector:
         return reflect(wi, facets.sample(wi, self.alpha, u1, u2, self.distribution))

@@ -20,7 +20,7 @@ from layerjax._numerics import safe_div
 from layerjax.channels import Channels, pick
 from layerjax.directions import UNIT_SLACK, Vector, dot, horizontal, select, split
 from layerjax.stack import Interface, Stack
-from layerjax.surfaces import Conductor
+from layerjax.surfaces import Conductor, Surface
 from layerjax.transport.known_directions import DirectionLookup
 
 Side = Literal["all", "reflection", "transmission"]
@@ -254,6 +254,15 @@ class RandomTransport(Transport):
         found, _ = self.estimate_albedo(state, split(wi.reshape(-1, 3)), channels, key)
         near, far = jnp.split(found, 2, axis=-1)
         return near.reshape(*batch, -1), far.reshape(*batch, -1)
+
+
+def refuse_film(base: Surface | None, transport: str) -> None:
+    """Raise a ValueError for a metal under a thin film, on behalf of a transport that takes metals from tables."""
+    if isinstance(base, Conductor) and base.film is not None:
+        raise ValueError(
+            f"base.film: {transport} carries no ThinFilm; AddingDoubling, RandomWalk, SingleScattering, SpongeCake and "
+            "WeidlichWilkie do"
+        )
 
 
 def refuse_vmf(stack: Stack, names: Sequence[str], transport: str) -> None:

@@ -21,7 +21,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from layerjax import fresnel
-from layerjax.channels import Channels, map_channels, mean, multiply, per_channel, total
+from layerjax.channels import Channels, mean, multiply, total
 from layerjax.directions import (
     Factor,
     Vector,
@@ -145,13 +145,7 @@ def _base_reflection(base: Surface, wi: Vector, wo: Vector, h: Vector, cosine: A
     if not isinstance(base, Conductor):
         return base.evaluate(wi, wo)
     lobe, _ = _facets(h, wi, wo, base.alpha)
-    return tuple(lobe * level for level in _conductor(base, cosine, above))
-
-
-def _conductor(base: Conductor, cosine: Array, above: Factor) -> Channels:
-    """Reflectance of a conductor whose index is counted from what surrounds the stack, under a medium of that index."""
-    ior, k = per_channel(base.ior), per_channel(base.k)
-    return map_channels(lambda ior, k: fresnel.conductor(cosine, ior / above, k / above), ior, k)
+    return tuple(lobe * level for level in base.relative_to(above).reflectance(cosine))
 
 
 def _facets(h: Vector, wi: Vector, wo: Vector, alpha: Array) -> tuple[Array, Array]:
@@ -191,9 +185,10 @@ def _choices(stack: Stack, wi: Vector) -> list[tuple[Array, Surface]]:
         above = layer.ior
     base = stack.base
     assert base is not None
-    level = (
-        mean(_conductor(base, w[2], above)) if isinstance(base, Conductor) else jnp.pi * mean(base.evaluate(w, normal))
-    )
+    if isinstance(base, Conductor):
+        level = mean(base.relative_to(above).reflectance(w[2]))
+    else:
+        level = jnp.pi * mean(base.evaluate(w, normal))
     energies.append((reached * level, base))
     total = sum((energy + LEAST_SHARE for energy, _ in energies), jnp.zeros_like(wi[2]))
     return [((energy + LEAST_SHARE) / total, surface) for energy, surface in energies]

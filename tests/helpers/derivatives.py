@@ -15,6 +15,7 @@ FLAKES = Medium(0.7, 0.8, lj.SGGX("surface", 0.3), 0.4)
 FIBERS = Medium(0.7, 0.8, lj.SGGX("fiber", 0.3, (0.5, 0.3, 0.7)), 0.4)
 DYE = Medium(0.7, 0.0)
 METAL = Conductor(0.4, 2.0, 0.3)
+TINTED = Conductor(0.4, 2.0, 0.3, film=lj.ThinFilm(1.8, 150.0, 550.0))
 FACE = Interface(1.5, 0.3)
 VMF_FACE = Interface(1.5, 0.3, "vmf")
 
@@ -31,6 +32,7 @@ STACKS = {
     "rough paint": Stack([], OrenNayar(0.5, 0.4)),
     "metal": Stack([], METAL),
     "metal, vmf": Stack([], Conductor(0.4, 2.0, 0.3, "vmf")),
+    "tinted metal": Stack([], TINTED),
     "face": Stack([FACE]),
     "varnish": Stack([FACE], Lambertian(0.5)),
     "varnish, vmf": Stack([VMF_FACE], Lambertian(0.5)),
@@ -38,6 +40,7 @@ STACKS = {
     "varnish on flakes' fit": Stack([FACE], VMFDiffuse(0.5, 0.3)),
     "varnish on flakes' transport": Stack([FACE], VMFDiffuse(0.5, 0.3, "all_orders")),
     "coated metal": Stack([FACE], METAL),
+    "coated tinted metal": Stack([FACE], TINTED),
     "coated metal, vmf": Stack([VMF_FACE], Conductor(0.4, 2.0, 0.3, "vmf")),
     "dyed varnish": Stack([FACE, DYE], Lambertian(0.5)),
     "dyed coat on metal": Stack([FACE, DYE], METAL),

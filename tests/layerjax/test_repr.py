@@ -38,6 +38,7 @@ AGAIN = {
     "Medium(thickness=1.0, phase=HenyeyGreenstein(g=0.7))": lj.Medium(1, phase=lj.HenyeyGreenstein(0.7)),
     "SGGX(kind='fiber', alpha=0.0001, axis=[1.0, 0.0, 0.0])": lj.SGGX("fiber", 1e-4, (1, 0, 0)),
     "Rayleigh()": lj.Rayleigh(),
+    "ThinFilm(ior=1.5, thickness_nm=100.0, wavelengths_nm=[610.0, 550.0])": lj.ThinFilm(1.5, 100, [610, 550]),
     "OrenNayar(albedo=0.5, roughness=0.3)": lj.OrenNayar(0.5, 0.3),
     "Stack(layers=[], base=Lambertian(albedo=[0.5]))": lj.Stack([], lj.Lambertian([0.5])),
     "Stack(layers=[Interface(ior=1.5, alpha=Free(0.2, 0.1, 0.3))])": lj.Stack([lj.Interface(1.5, FREE)]),

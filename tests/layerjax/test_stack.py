@@ -70,6 +70,9 @@ def test_every_range_is_enforced_at_both_ends():
         "Conductor.k": lambda v: lj.Conductor(1.0, v, 0.1),
         "Conductor.alpha": lambda v: lj.Conductor(1.0, 1.0, v),
         "Conductor.alpha, vmf": lambda v: lj.Conductor(1.0, 1.0, v, "vmf"),
+        "ThinFilm.ior": lambda v: lj.ThinFilm(v, 100.0, 550.0),
+        "ThinFilm.thickness_nm": lambda v: lj.ThinFilm(1.5, v, 550.0),
+        "ThinFilm.wavelengths_nm": lambda v: lj.ThinFilm(1.5, 100.0, v),
     }
     assert set(makers) == {name for name in lj.RANGES if hasattr(lj, name.split(".")[0])}  # those of the package
     for name, make in makers.items():

@@ -24,6 +24,9 @@ FUNCTIONS = {
     "pdf": {**PAIR, **SINGLE},
     "albedo": {**LIT, **SINGLE, "nodes": 8, "key": KEY},
     "unscattered": LIT,
+    "metal": {"name": "gold", "wavelengths_nm": 550.0},
+    "cauchy": {"wavelengths_nm": 550.0, "a": 1.5, "b": 0.004, "c": 0.0},
+    "sellmeier": {"wavelengths_nm": 550.0, "b": 1.0, "c": 0.01},
     "prepare": {"stack": STACK, **SINGLE},
     "choose_transport": {**PAIR, **SINGLE},
     "goniophotometer": {
@@ -49,7 +52,8 @@ CLASSES = {
     "Lambertian": {"albedo": 0.5},
     "OrenNayar": {"albedo": 0.5, "roughness": 0.3},
     "VMFDiffuse": {"albedo": 0.5, "roughness": 0.3},
-    "Conductor": {"ior": 0.2, "k": 3.0, "alpha": 0.1, "distribution": "ggx"},
+    "Conductor": {"ior": 0.2, "k": 3.0, "alpha": 0.1, "distribution": "ggx", "film": lj.ThinFilm(1.5, 100.0, 550.0)},
+    "ThinFilm": {"ior": 1.5, "thickness_nm": 100.0, "wavelengths_nm": 550.0},
     "AddingDoubling": {"nodes": 8, "modes": 4, "facet_multiple_scattering": False, "tolerance": 1e-3},
     "ENDF": {"bounces": 1},
     "RandomWalk": {"paths": 64, "orders": "all", "facet_multiple_scattering": False, "batch_size": 64},
@@ -72,6 +76,7 @@ WRONG = {
 NONE_IS_FINE = {
     ("Medium", "f0"), ("TurbidMedium", "f0"), ("Stack", "base"), ("evaluate", "key"), ("albedo", "key"),
     ("AddingDoubling", "nodes"), ("AddingDoubling", "modes"), ("AddingDoubling", "tolerance"), ("SGGX", "axis"),
+    ("Conductor", "film"),
 }  # fmt: skip
 """Arguments that may be left out."""
 

@@ -5,9 +5,8 @@ from collections.abc import Sequence
 import jax.numpy as jnp
 from jax import Array
 
-from layerjax import fresnel
 from layerjax._numerics import clamp_min, safe_div
-from layerjax.channels import per_channel, pick
+from layerjax.channels import pick
 from layerjax.directions import Vector, reflect
 from layerjax.surfaces import Conductor, Surface
 from layerjax.transport.adding_doubling.facet_scattering import (
@@ -40,10 +39,10 @@ def _conductor(region: Region, base: Conductor, kernels: Sequence[Array], multip
     cosine, seen = map_visible_normals(
         seen_by, region, normals, jnp.ones((), region.cosine.dtype), "reflected", ENERGY_POINTS
     )
-    ior, k = per_channel(base.ior), per_channel(base.k)
+    levels = base.reflectance(cosine)
     operators, given = [], []
     for c, kernel in enumerate(kernels):
-        energy = jnp.sum(seen * fresnel.conductor(cosine, pick(ior, c), pick(k, c)), axis=-1)
+        energy = jnp.sum(seen * pick(levels, c), axis=-1)
         operators.append(scale_to_energy(region, kernel, energy))
         if multiple:
             gain = _coloured_return(energy, jnp.sum(seen, axis=-1), region.weight)

@@ -290,7 +290,7 @@ def _relative_conductor(base: Surface, above: Array) -> Surface:
     """A conductor's index counted from what surrounds the stack, as one counted from what lies on it."""
     if not isinstance(base, Conductor):
         return base
-    return eqx.tree_at(lambda surface: (surface.ior, surface.k), base, (base.ior / above, base.k / above))
+    return base.relative_to(above)
 
 
 def ranks(stack: Stack) -> tuple[int, ...] | None:

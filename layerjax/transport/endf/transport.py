@@ -20,7 +20,7 @@ from layerjax.directions import Vector, flip, is_above, sanitise, select
 from layerjax.normals.vmf import Masking, concentration
 from layerjax.stack import Interface, Medium, Stack, is_known, media_of
 from layerjax.surfaces import Conductor
-from layerjax.transport.contract import TEXELS, DeterministicTransport, Side
+from layerjax.transport.contract import TEXELS, DeterministicTransport, Side, refuse_film
 from layerjax.transport.endf import sampling
 from layerjax.transport.endf.chains import Coat, Form, LowerSide, Options, UpperSide, reflections
 from layerjax.transport.endf.slab import transmissions
@@ -115,6 +115,7 @@ class ENDF(DeterministicTransport):
                 f"base: ENDF carries no {type(stack.base).__name__} (a Conductor, or no base); Statistical, "
                 "AddingDoubling and RandomWalk do"
             )
+        refuse_film(stack.base, "ENDF")
 
     def prepare(self, stack: Stack) -> Sides:
         faces = [layer for layer in stack.layers if isinstance(layer, Interface)]

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from layerjax import fresnel
-from layerjax.channels import Channels, map_channels, per_channel
+from layerjax.channels import Channels
 from layerjax.directions import Vector, add, dot, flip, normalize, reflect, scale, select
 from layerjax.microsurface.heitz_walk import (
     escape_probability,
@@ -157,6 +157,4 @@ def _mirror_contribution(wi: Vector, wo: Vector, height: Array, alpha: Array) ->
 
 
 def _reflectance(base: Conductor, cosine: Array) -> Channels:
-    ior, k = per_channel(base.ior), per_channel(base.k)
-    cosine = jnp.minimum(cosine, 1.0)
-    return map_channels(lambda ior, k: fresnel.conductor(cosine, ior, k), ior, k)
+    return base.reflectance(jnp.minimum(cosine, 1.0))

@@ -8,7 +8,6 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import Array
@@ -51,8 +50,7 @@ def base_of(scene: Scene) -> Surface | None:
     """The base, its index taken relative to the medium on it."""
     if not isinstance(scene.base, Conductor) or not scene.interfaces:
         return scene.base
-    above = scene.indices[-1]
-    return eqx.tree_at(lambda base: (base.ior, base.k), scene.base, (scene.base.ior / above, scene.base.k / above))
+    return scene.base.relative_to(scene.indices[-1])
 
 
 def orient(w: Vector, from_above: Array, sign: float = 1.0) -> Vector:

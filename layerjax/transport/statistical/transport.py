@@ -28,7 +28,7 @@ from layerjax.quadrature import gauss_legendre
 from layerjax.stack import Interface, Medium, Stack
 from layerjax.surfaces import Conductor, Surface
 from layerjax.surfaces.interface import interface_reflection
-from layerjax.transport.contract import TEXELS, DeterministicTransport, Side, refuse_vmf
+from layerjax.transport.contract import TEXELS, DeterministicTransport, Side, refuse_film, refuse_vmf
 from layerjax.transport.known_directions import DirectionLookup
 from layerjax.transport.statistical.coated_base import is_coated, make_coated
 from layerjax.transport.statistical.diffuse_base import make_diffuse
@@ -129,6 +129,7 @@ class Statistical(DeterministicTransport):
 
     def check(self, stack: Stack, names: Sequence[str]) -> None:
         refuse_vmf(stack, names, "Statistical")
+        refuse_film(stack.base, "Statistical")
         _check_indices(stack, names)
         for name, layer in zip(names, stack.layers, strict=True):
             if isinstance(layer, Medium) and layer.phase.forward_lobe is None:
@@ -368,4 +369,4 @@ def _facet(facet: Facet, wi: Vector, wo: Vector) -> Channels:
     what, relative, _ = facet
     if isinstance(what, Interface):
         return (interface_reflection(wi, wo, relative, jnp.asarray(what.alpha)),)
-    return eqx.tree_at(lambda c: (c.ior, c.k), what, (what.ior / relative, what.k / relative)).evaluate(wi, wo)
+    return what.relative_to(relative).evaluate(wi, wo)

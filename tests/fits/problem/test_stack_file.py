@@ -47,6 +47,7 @@ INSTRUMENT = Instrument(detector_aperture=2.0, tilt=Free(0.0, -1.0, 1.0))
 BASE = 'base = { kind = "Lambertian", albedo = 0.5 }\n'
 LAYER = "[[layers]]\nkind = 'Medium'\n"
 THIN = LAYER + "thickness = 1\n"
+TINTED = "base = {{ kind = 'Conductor', ior = 1, k = 1, alpha = 1, film = {} }}\n"
 
 
 def read(tmp_path: Path, text: str | bytes):
@@ -115,7 +116,7 @@ LAW = PowerLaw(Free(4.0, 0.1, 50.0), Free(0.0, -4.0, 4.0), (450.0, 550.0), 600.0
 
 def test_dictionary_round_trip():
     for stack in (
-        lj.Stack([], base=lj.Conductor(ior=[0.2, 0.9, 1.1], k=3.9, alpha=0.1)),
+        lj.Stack([], lj.Conductor([0.2, 0.9], 3.9, 0.1, film=lj.ThinFilm(1.5, Free(9.0, 0.0, 99.0), [610.0, 550.0]))),
         lj.Stack([], base=lj.VMFDiffuse(Free(0.4, 0.0, [0.8, 0.9, 1.0]), Free(0.3, 0.0, 1.0), form="all_orders")),
         lj.Stack([lj.Medium(thickness=1 / 3, phase=lj.HenyeyGreenstein(g=Free(0.1, -0.9, 0.9)), f0=0.04)]),
         lj.Stack([lj.Medium(Free(1.0, 0.1, 10.0, LogUniform()), phase=lj.Rayleigh())], lj.OrenNayar(0.5, 0.3)),
@@ -144,6 +145,8 @@ WRONG = {
     FREE.format(", prior = { kind = 'Normal', mean = 1, sd = -1 }"): r"layers\[0\].thickness.prior: Normal.sd is -1",
     THIN + "phase = { kind = 'SGGX', shape = 'ball', alpha = 0.1 }\n": r"layers\[0\].phase: SGGX.shape: ",
     BASE + "noise = { discrepancy = { length_half = -3.0 } }\n": "noise.discrepancy.length_half is -3.0",
+    TINTED.format("{ ior = 1 }"): "base.film has no thickness_nm, which ThinFilm needs",
+    TINTED.format("3"): r"base: Conductor\.film: 3 is not a ThinFilm or None",
     BASE + "scale = { start = [1, 1], low = 0.5, high = 2 }\n": "scale has 2 channels, must be one number for all",
     BASE + "instrument = { detector_aperture = 31 }\n": r"instrument.detector_aperture is 31; .* in \[0, 30\]",
     BASE + "transport = 'Singlescattering'\n": "transport is 'Singlescattering' .did you mean 'SingleScattering'",
