@@ -16,6 +16,7 @@ from layerjax._checks import abbreviate
 RANGES: dict[str, tuple[float, float]] = {
     "Interface.ior": (0.25, 4.0),
     "Interface.alpha": (1e-4, 1.0),
+    "Interface.alpha, beckmann": (1e-4, 1.0),
     "Interface.alpha, vmf": (1e-4, 15.0),
     "Medium.thickness": (0.0, 1e4),
     "Medium.albedo": (0.0, 1.0),
@@ -34,6 +35,7 @@ RANGES: dict[str, tuple[float, float]] = {
     "Conductor.ior": (0.01, 10.0),
     "Conductor.k": (0.0, 20.0),
     "Conductor.alpha": (1e-4, 1.0),
+    "Conductor.alpha, beckmann": (1e-4, 1.0),
     "Conductor.alpha, vmf": (1e-4, 15.0),
     "ThinFilm.ior": (0.25, 4.0),
     "ThinFilm.thickness_nm": (0.0, 5000.0),

@@ -43,9 +43,10 @@ class Interface(ReprModule):
                                                                         to the surroundings of the stack
     alpha        alpha  ()    1    [1e-4, 1]    required yes            width of D; [1e-4, 15] for ``"vmf"``, where
                                                                         kappa = 2 / alpha^2
-    distribution D                 "ggx", "vmf" "ggx"    no             GGX or von Mises-Fisher; the latter only in
-                                                                        `ENDF`, and in `AddingDoubling` and `RandomWalk`
-                                                                        with ``facet_multiple_scattering=False``
+    distribution D                 "ggx",       "ggx"    no             GGX, Beckmann (Gaussian slopes) or von
+                                   "beckmann",                          Mises-Fisher; the last two only in `ENDF`, and
+                                   "vmf"                                in `AddingDoubling` and `RandomWalk` with
+                                                                        ``facet_multiple_scattering=False``
     ============ ====== ===== ==== ============ ======== ============== ================================================
 
     Light that is blocked by masking is lost, also where the index hardly changes: with ior 1.001 and alpha 0.3, light

@@ -207,9 +207,9 @@ def _base(base: Any, above: float) -> dict[str, Any]:
 
 
 def _normals(surface: Any) -> str:
-    if surface.distribution != "ggx":
-        raise ValueError(f"{type(surface).__name__}.distribution: Mitsuba has no {surface.distribution!r} normals")
-    return "ggx"
+    if surface.distribution == "vmf":
+        raise ValueError(f"{type(surface).__name__}.distribution: Mitsuba has no 'vmf' normals")
+    return str(surface.distribution)
 
 
 def _volume(value: Any) -> dict[str, Any]:

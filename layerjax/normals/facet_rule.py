@@ -1,4 +1,4 @@
-"""Quadrature of the facets that a direction sees, GGX or von Mises-Fisher, in coordinates about that direction.
+"""Quadrature of the facets that a direction sees, in coordinates about that direction.
 
 A facet has coordinates: the angle theta_d between its normal and the direction, on which Fresnel's equations depend,
 and an azimuth psi about the direction. So the critical angle is a line of constant theta_d: panels end there, with the
@@ -7,8 +7,8 @@ or by light that is mirrored below the horizon. Points move smoothly with the wi
 no point crosses an edge of what is summed.
 
 Both coordinates are fitted to the density of normals, so that the same points serve all widths. GGX: theta_d is
-stretched like a sinh about its peak, psi by the Moebius map under which the density is nearly even. vMF normals have no
-tails: both coordinates end where the density does.
+stretched like a sinh about its peak, psi by the Moebius map under which the density is nearly even. vMF and Beckmann
+normals have no tails: both coordinates end where the density of vMF normals does, which is no narrower.
 """
 
 from typing import Literal, NamedTuple
@@ -19,7 +19,7 @@ from jax import Array
 from layerjax._numerics import clamp_max, clamp_min, safe_div, safe_sqrt
 from layerjax.directions import Vector
 from layerjax.normals import vmf
-from layerjax.normals.facets import Distribution
+from layerjax.normals.facets import Distribution, density, twice_projected_area
 from layerjax.normals.ggx import ggx_masking
 from layerjax.quadrature import gauss_legendre
 
@@ -43,7 +43,7 @@ class Parallels(NamedTuple):
     sine, cosine: of theta_d less theta. facing, across: cosine and sine of theta_d. squeeze: of tan(psi/2), for the
     density of normals; end: of what is squeezed, where the normal, or the light mirrored at it, reaches the horizon;
     start: where refracted light comes above it (None: 0, of reflected light).
-    level: the density of normals (vMF: 1) times the visible area, without what psi changes.
+    level: the density of normals (others: 1) times the visible area, without what psi changes.
     """
 
     sine: Array
@@ -86,15 +86,15 @@ def parallels(
         far = least + scale * clamp_min(1.0 - mu * c + sin_w * s, 0.0)
         squeeze = jnp.sqrt(near / far)
         visible = ggx_masking((-sin_w, jnp.zeros_like(mu), mu), alpha) / mu
-        density = (8.0 / jnp.pi) * alpha * alpha
+        scale_of_density = (8.0 / jnp.pi) * alpha * alpha
     else:
         squeeze = jnp.ones_like(s)
-        visible = vmf.masking_over_cosine(mu, vmf.concentration(alpha))
-        density = jnp.asarray(8.0, mu.dtype)
+        visible = 2.0 / twice_projected_area(mu, (-sin_w, jnp.zeros_like(mu), mu), alpha, distribution)
+        scale_of_density = jnp.asarray(8.0, mu.dtype)
     # psi ends where the normal, or the light mirrored at it, reaches the horizon
     level, swing = mu * c - (0.5 * mu / c if event == "reflected" else 0.0), sin_w * s
     end = _azimuth_of(swing, level, squeeze)
-    if distribution == "vmf":
+    if distribution != "ggx":
         # the density goes like exp(-2 kappa sin_w s sin(psi/2)^2): by this sine, and up to a tangent of psi/4 beyond it
         last = VMF_EXTENT / jnp.sqrt(1.0 + 2.0 * vmf.concentration(alpha) * swing)
         end = clamp_max(end, 0.5 * last * (1.0 + last * last))
@@ -105,7 +105,7 @@ def parallels(
         # of normals, mz at most: mu / (c - n cos(theta_t)), without the difference
         highest = mu * (c + n * safe_sqrt(1.0 - (s / n) ** 2)) / ((1.0 - n) * (1.0 + n))
         start = jnp.where(total, clamp_max(_azimuth_of(swing, mu * c - highest, squeeze), end), 0.0)
-    return Parallels(sin_apart, cos_apart, c, s, squeeze, end, density * measure * s * c * visible, start)
+    return Parallels(sin_apart, cos_apart, c, s, squeeze, end, scale_of_density * measure * s * c * visible, start)
 
 
 def _azimuth_of(swing: Array, level: Array, squeeze: Array) -> Array:
@@ -148,7 +148,7 @@ def visible_normals(
         slopes = (mx / alpha) ** 2 + (my / alpha) ** 2
         shares = turn / (alpha * alpha) / (alpha * alpha) / (mz * mz + slopes) ** 2
     else:
-        shares = turn * vmf.hemisphere_density((mx, my, mz), vmf.concentration(alpha))
+        shares = turn * density((mx, my, mz), alpha, distribution)
     flat = (mu.shape[0], -1)
     facing = circles.facing[..., None] * jnp.ones_like(back)
     return (mx.reshape(flat), my.reshape(flat), mz.reshape(flat)), facing.reshape(flat), shares.reshape(flat)
@@ -212,7 +212,7 @@ def _smooth_edges(places: Array, x: Array) -> tuple[Array, Array]:
 
 
 def _place(t: Array, distribution: Distribution) -> Array:
-    if distribution == "vmf":
+    if distribution != "ggx":
         return jnp.clip(t, -VMF_EXTENT, VMF_EXTENT)
     y = jnp.arcsinh(t)
     return y / jnp.sqrt(1.0 + (y / STRETCH_LIMIT) ** 2)
@@ -220,7 +220,7 @@ def _place(t: Array, distribution: Distribution) -> Array:
 
 def _inverse_place(place: Array, distribution: Distribution) -> tuple[Array, Array]:
     """t of a place, and its slope: the inverse of `_place`."""
-    if distribution == "vmf":
+    if distribution != "ggx":
         return place, jnp.ones_like(place)
     inverse = 1.0 / jnp.sqrt(1.0 - (place / STRETCH_LIMIT) ** 2)
     y = place * inverse

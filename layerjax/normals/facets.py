@@ -1,10 +1,10 @@
-"""Normals of the facets of a rough surface: GGX or von Mises-Fisher, behind one set of functions.
+"""Normals of the facets of a rough surface: GGX, Beckmann or von Mises-Fisher, behind one set of functions.
 
-Which of the two is known while tracing, so that neither pays for the other. Masking is separable Smith. GGX normals are
-drawn as they are seen. Seen vMF normals have no sampler in closed form: the polar angle is drawn as it is, the azimuth
-about the plane of incidence from a density linear between 0 and the rim beyond which facets look away. None is lost,
-and what is left to weigh (see `draw_weight`) is 1 where normals are narrow, with a standard deviation of 0.5 at grazing
-light and of 0.6 at kappa = 0.
+Which one is known while tracing, so that none pays for another. Masking is separable Smith. GGX and Beckmann normals
+are drawn as they are seen. Seen vMF normals have no sampler in closed form: the polar angle is drawn as it is, the
+azimuth about the plane of incidence from a density linear between 0 and the rim beyond which facets look away. None is
+lost, and what is left to weigh (see `draw_weight`) is 1 where normals are narrow, with a standard deviation of 0.5 at
+grazing light and of 0.6 at kappa = 0.
 """
 
 from typing import Any, Literal, get_args
@@ -17,12 +17,13 @@ from layerjax._numerics import clamp_max, clamp_min, safe_div, safe_sqrt
 from layerjax._parameters import check_range, is_placeholder
 from layerjax.directions import Vector, dot
 from layerjax.normals import vmf
+from layerjax.normals.beckmann import beckmann_area, beckmann_density, beckmann_sample
 from layerjax.normals.ggx import ggx_area, ggx_density, ggx_masking, ggx_sample
 from layerjax.normals.sggx import radii
 from layerjax.quadrature import Nodes, flake_rule, panels
 
-Distribution = Literal["ggx", "vmf"]
-"""Normals of Walter et al. 2007, or von Mises-Fisher normals with kappa = 2 / alpha^2 (Guo et al. 2015)."""
+Distribution = Literal["ggx", "beckmann", "vmf"]
+"""Normals of Walter et al. 2007, the first two, or von Mises-Fisher ones with kappa = 2 / alpha^2 (Guo et al. 2015)."""
 
 MOST_SLOPE = 0.999
 """Slope of the density of azimuths, at most: at 1 the rim would have density 0."""
@@ -45,6 +46,8 @@ def density(m: Vector, alpha: Array, distribution: Distribution) -> Array:
     """Density D(m) of normals above the horizon, 1/sr; the integral of D cos over the hemisphere is 1."""
     if distribution == "ggx":
         return ggx_density(m, alpha)
+    if distribution == "beckmann":
+        return beckmann_density(m, alpha)
     return vmf.hemisphere_density(m, vmf.concentration(alpha))
 
 
@@ -55,6 +58,8 @@ def twice_projected_area(cosine: Array, w: Vector, alpha: Array, distribution: D
     """
     if distribution == "ggx":
         return cosine + ggx_area(w, alpha)
+    if distribution == "beckmann":
+        return beckmann_area(cosine, w, alpha)
     return 2.0 / vmf.masking_over_cosine(cosine, vmf.concentration(alpha))
 
 
@@ -67,6 +72,8 @@ def sample(wi: Vector, alpha: Array, u1: Array, u2: Array, distribution: Distrib
     """A normal that is seen from wi (above the horizon), from two uniform numbers; see `reflection_pdf`."""
     if distribution == "ggx":
         return ggx_sample(wi, alpha, u1, u2)
+    if distribution == "beckmann":
+        return beckmann_sample(wi, alpha, u1, u2)
     normal = vmf.hemisphere_sample(vmf.concentration(alpha), u1, jnp.zeros_like(u2))
     planar, x, y = _plane(wi)
     sine, cosine = safe_sqrt(normal[0] * normal[0] + normal[1] * normal[1]), normal[2]
@@ -82,13 +89,15 @@ def reflection_pdf(h: Vector, wi: Vector, alpha: Array, distribution: Distributi
     """Density, 1/sr, of directions mirrored at facets that `sample` draws, by their half vector with wi."""
     if distribution == "ggx":
         return ggx_density(h, alpha) * ggx_masking(wi, alpha) / (4.0 * wi[2])
+    if distribution == "beckmann":
+        return beckmann_density(h, alpha) / (2.0 * beckmann_area(wi[2], wi, alpha))
     kappa = vmf.concentration(alpha)
     drawn = _share_drawn(wi, h, kappa) * vmf.hemisphere_norm(kappa) * vmf.hemisphere_density(h, kappa)
     return drawn / (4.0 * clamp_min(dot(wi, h), LEAST_WEIGHT))
 
 
 def draw_weight(wi: Vector, m: Vector, alpha: Array) -> Array:
-    """Density of seen vMF normals, D <wi, m> G1(wi) / cos, over that of `sample`; of GGX normals it is 1.
+    """Density of seen vMF normals, D <wi, m> G1(wi) / cos, over that of `sample`; of others it is 1.
 
     It may be divided by: at the rim it stays above 0.
     """
@@ -101,6 +110,7 @@ def rule(wi: Vector, alpha: Array, nodes: int, distribution: Distribution) -> No
     """Quadrature over the directions above the horizon that the facets mirror wi to (see `layerjax.quadrature`)."""
     if distribution == "ggx":
         return flake_rule(wi, *radii("surface", alpha), None, nodes)[0]
+    # Beckmann normals end where vMF normals as wide do, or before
     return _mirror_rule(wi, vmf.concentration(alpha), nodes)
 
 

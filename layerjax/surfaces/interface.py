@@ -125,7 +125,7 @@ def interface_pdf(
 ) -> Array:
     """Density of `interface_sample`, 1/sr, from the BSDF f of the pair: f |cos_o| / G1(wo), less what draws weigh."""
     density = 0.5 * f * facets.twice_projected_area(jnp.abs(wo[2]), wo, alpha, distribution)
-    if distribution == "ggx":
+    if distribution != "vmf":
         return density
     return density / facets.draw_weight(wi, facet_normal(wi, wo, ior), alpha)
 

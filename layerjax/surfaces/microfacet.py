@@ -29,7 +29,9 @@ class Conductor(Surface):
                                                                            coefficient), with the same reference
     alpha        alpha  ()       1    [1e-4, 1]    required yes            width of D; [1e-4, 15] for ``"vmf"``, where
                                                                            kappa = 2 / alpha^2
-    distribution D                    "ggx", "vmf" "ggx"    no             GGX or von Mises-Fisher, as of an `Interface`
+    distribution D                    "ggx",       "ggx"    no             as of an `Interface`
+                                      "beckmann",
+                                      "vmf"
     film                              `ThinFilm`   None     yes            transparent film on every facet; not in
                                                                            `Statistical` and `ENDF`
     ============ ====== ======== ==== ============ ======== ============== =============================================

@@ -265,11 +265,11 @@ def refuse_film(base: Surface | None, transport: str) -> None:
         )
 
 
-def refuse_vmf(stack: Stack, names: Sequence[str], transport: str) -> None:
-    """Raise a ValueError that names the first von Mises-Fisher facets, on behalf of a transport without them."""
+def require_ggx(stack: Stack, names: Sequence[str], transport: str) -> None:
+    """Raise a ValueError that names the first facets that are not GGX, on behalf of a transport without others."""
     for name, part in [*zip(names, stack.layers, strict=True), ("base", stack.base)]:
-        if isinstance(part, Interface | Conductor) and part.distribution == "vmf":
+        if isinstance(part, Interface | Conductor) and part.distribution != "ggx":
             raise ValueError(
-                f'{name}.distribution: {transport} carries no "vmf" normals; AddingDoubling and RandomWalk with '
-                "facet_multiple_scattering=False do, and ENDF for metals, coated metals and slabs"
+                f'{name}.distribution: {transport} carries no "{part.distribution}" normals; AddingDoubling and '
+                "RandomWalk with facet_multiple_scattering=False do, and ENDF for metals, coated metals and slabs"
             )

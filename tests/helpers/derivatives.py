@@ -31,10 +31,12 @@ STACKS = {
     "flakes' transport": Stack([], VMFDiffuse(0.5, 0.3, "all_orders")),
     "rough paint": Stack([], OrenNayar(0.5, 0.4)),
     "metal": Stack([], METAL),
+    "metal, beckmann": Stack([], Conductor(0.4, 2.0, 0.3, "beckmann")),
     "metal, vmf": Stack([], Conductor(0.4, 2.0, 0.3, "vmf")),
     "tinted metal": Stack([], TINTED),
     "face": Stack([FACE]),
     "varnish": Stack([FACE], Lambertian(0.5)),
+    "varnish, beckmann": Stack([Interface(1.5, 0.3, "beckmann")], Lambertian(0.5)),
     "varnish, vmf": Stack([VMF_FACE], Lambertian(0.5)),
     "varnish on rough paint": Stack([FACE], OrenNayar(0.5, 0.4)),
     "varnish on flakes' fit": Stack([FACE], VMFDiffuse(0.5, 0.3)),
@@ -111,8 +113,8 @@ def fields_of(stack, fixed=None):
         for part in parents:
             owner = owner[int(part)] if part.isdigit() else getattr(owner, part)
         key = f"{type(owner).__name__}.{field}"
-        vmf = field == "alpha" and getattr(owner, "distribution", "ggx") == "vmf"
-        bounds = RANGES.get(f"{key}, vmf" if vmf else key)
+        kind = getattr(owner, "distribution", "ggx") if field == "alpha" else "ggx"
+        bounds = RANGES.get(key if kind == "ggx" else f"{key}, {kind}")
         if path != fixed:
             yield Field(path, place, np.asarray(leaf), key if bounds else None, bounds or (-1.0, 1.0))
         place += np.size(leaf)

@@ -50,6 +50,7 @@ def test_every_range_is_enforced_at_both_ends():
     makers = {
         "Interface.ior": lambda v: lj.Interface(v, 0.1),
         "Interface.alpha": lambda v: lj.Interface(1.5, v),
+        "Interface.alpha, beckmann": lambda v: lj.Interface(1.5, v, "beckmann"),
         "Interface.alpha, vmf": lambda v: lj.Interface(1.5, v, "vmf"),
         "Medium.thickness": lambda v: lj.Medium(v),
         "Medium.albedo": lambda v: lj.Medium(1.0, v),
@@ -69,6 +70,7 @@ def test_every_range_is_enforced_at_both_ends():
         "Conductor.ior": lambda v: lj.Conductor(v, 1.0, 0.1),
         "Conductor.k": lambda v: lj.Conductor(1.0, v, 0.1),
         "Conductor.alpha": lambda v: lj.Conductor(1.0, 1.0, v),
+        "Conductor.alpha, beckmann": lambda v: lj.Conductor(1.0, 1.0, v, "beckmann"),
         "Conductor.alpha, vmf": lambda v: lj.Conductor(1.0, 1.0, v, "vmf"),
         "ThinFilm.ior": lambda v: lj.ThinFilm(v, 100.0, 550.0),
         "ThinFilm.thickness_nm": lambda v: lj.ThinFilm(1.5, v, 550.0),

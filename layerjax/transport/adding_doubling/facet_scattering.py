@@ -110,7 +110,7 @@ def _refract(
 def dense_refracted_rays(grid: Grid, near: Region, far: Region, normals: Normals, modes: int) -> tuple[Vector, Array]:
     """Of light from every near node, by facets: where to and how much is refracted."""
     ratio = far.ior / near.ior
-    if normals.distribution == "vmf":
+    if normals.distribution != "ggx":
         # about the direction, not the normal: what a mirror sends back through them asks for more than their own caps
         return refracted_rays(near, ratio, normals, (3 * polar_count(grid) // 2, 3 * azimuth_count(grid, modes) // 2))
     m, weight, wi = _ggx_normals(grid, near, normals.alpha, modes)

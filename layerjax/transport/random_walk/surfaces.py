@@ -97,7 +97,7 @@ def bounce(
         def event(distribution: Distribution) -> Bounce:
             wo, leaves, m = interface_event(wi, ior, alpha, u1, u2, u3, distribution)
             weight = masking((wo[0], wo[1], jnp.abs(wo[2])), alpha, distribution)
-            if distribution != "ggx":
+            if distribution == "vmf":
                 weight = weight * draw_weight(wi, m, alpha)
             sent: Channels = ()
             if towards is not None:
@@ -214,8 +214,8 @@ def _by_distribution(scene: Scene, surface: Array | None, function: Callable[[Di
 
 
 def _weight(value: Array, density: Array, base: Surface) -> Array:
-    """Their quotient; 0 where vMF normals are so improbable that both are 0."""
-    vanishes = isinstance(base, Conductor) and base.distribution == "vmf"
+    """Their quotient; 0 where normals are so improbable that both are 0."""
+    vanishes = isinstance(base, Conductor) and base.distribution != "ggx"
     return safe_div(value, density) if vanishes else value / density
 
 

@@ -18,7 +18,7 @@ from layerjax.directions import Vector, flip, half_vector, reflect, sanitise, se
 from layerjax.normals.facets import reflection_pdf, sample
 from layerjax.stack import Interface, Stack
 from layerjax.surfaces.lambertian import sample_cosine
-from layerjax.transport.contract import RandomTransport, Side, refuse_vmf
+from layerjax.transport.contract import RandomTransport, Side, require_ggx
 from layerjax.transport.random_walk.batches import average, replace_invalid
 from layerjax.transport.random_walk.scene import Scene
 from layerjax.transport.random_walk.state import Step
@@ -54,7 +54,7 @@ class RandomWalk(RandomTransport):
 
     def check(self, stack: Stack, names: Sequence[str]) -> None:
         if self.facet_multiple_scattering:
-            refuse_vmf(stack, names, "RandomWalk(facet_multiple_scattering=True)")
+            require_ggx(stack, names, "RandomWalk(facet_multiple_scattering=True)")
 
     def prepare(self, stack: Stack) -> Stack:
         return stack

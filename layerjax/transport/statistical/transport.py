@@ -28,7 +28,7 @@ from layerjax.quadrature import gauss_legendre
 from layerjax.stack import Interface, Medium, Stack
 from layerjax.surfaces import Conductor, Surface
 from layerjax.surfaces.interface import interface_reflection
-from layerjax.transport.contract import TEXELS, DeterministicTransport, Side, refuse_film, refuse_vmf
+from layerjax.transport.contract import TEXELS, DeterministicTransport, Side, refuse_film, require_ggx
 from layerjax.transport.known_directions import DirectionLookup
 from layerjax.transport.statistical.coated_base import is_coated, make_coated
 from layerjax.transport.statistical.diffuse_base import make_diffuse
@@ -128,7 +128,7 @@ class Statistical(DeterministicTransport):
                 raise ValueError(f"Statistical.{name}: {value!r} is not one of {allowed}")
 
     def check(self, stack: Stack, names: Sequence[str]) -> None:
-        refuse_vmf(stack, names, "Statistical")
+        require_ggx(stack, names, "Statistical")
         refuse_film(stack.base, "Statistical")
         _check_indices(stack, names)
         for name, layer in zip(names, stack.layers, strict=True):

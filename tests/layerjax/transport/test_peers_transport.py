@@ -35,6 +35,7 @@ COATED = {
     "an interface in haze": lj.Stack([haze(0.4, 0.3, 0.9), lj.Interface(1.5, 0.3), haze(0.0, 1.0, 0.9)]),
     "a haze between interfaces": lj.Stack([lj.Interface(1.5, 0.3), haze(0.4, 1.0, 0.9), lj.Interface(1.0, 0.4)]),
     "a coat on a diffuse base": lj.Stack([lj.Interface(1.5, 0.3), haze(0.4, 0.5, 0.9)], lj.Lambertian([0.8, 0.4, 0.2])),
+    "a Beckmann coat on a diffuse base": lj.Stack([lj.Interface(1.5, 0.3, "beckmann")], lj.Lambertian(0.6)),
     "flakes on metal": lj.Stack(
         [flakes("surface", 0.3, None, 0.5, 0.9)], lj.Conductor([0.2, 0.9, 1.5], [3.9, 2.4, 1.9], 0.3)
     ),
@@ -112,6 +113,8 @@ def evaluated(stack, wi, wo, transport):
 SURFACES = {
     "dielectric, step up": (lj.Stack([lj.Interface(1.5, 0.2)]), ("above", "below")),
     "dielectric, step down": (lj.Stack([lj.Interface(0.7, 0.4)]), ("above", "below")),
+    "Beckmann dielectric": (lj.Stack([lj.Interface(1.5, 0.3, "beckmann")]), ("above", "below")),
+    "Beckmann conductor": (lj.Stack([], lj.Conductor(0.2, 3.9, 0.2, "beckmann")), ("above",)),
     "conductor": (lj.Stack([], lj.Conductor([0.2, 0.9, 1.5], [3.9, 2.4, 1.9], 0.2)), ("above",)),
 }
 
