@@ -192,7 +192,7 @@ def exit_density(
         lobe, transmittance = refraction_lobe(wi, wo, ior, alpha, distribution)
         value = jnp.where(wo[2] < 0, 2.0 * lobe / twice_projected_area(wi[2], wi, alpha, distribution), 0.0)
         passed = transmittance * 2.0 / twice_projected_area(jnp.abs(wo[2]), wo, alpha, distribution)
-        if distribution == "ggx":
+        if distribution != "vmf":
             return value, passed
         weight = draw_weight(wi, facet_normal(wi, wo, ior), alpha)
         return value / weight, passed * weight
