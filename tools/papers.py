@@ -49,7 +49,7 @@ PAPERS = (
         2018,
         "Belcour 2018, *Efficient Rendering of Layered Materials using an Atomic Decomposition with Statistical "
         "Operators*",
-        ("transport/statistical/[!d]*",),
+        ("transport/lobes/*", "transport/statistical/[!d]*"),
         "`Statistical`.",
     ),
     Paper(

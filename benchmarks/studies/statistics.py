@@ -17,7 +17,7 @@ import layerjax as lj
 from benchmarks.measuring import environment
 from benchmarks.measuring.writing import DIRECTORY, environment_lines, table, write
 from layerjax.quadrature import gauss_legendre
-from layerjax.transport.statistical.lobes import Options, statistics
+from layerjax.transport.lobes.statistics import Options, statistics
 
 ANGLES = (0.0, 30.0, 60.0, 75.0)
 FORWARD, SYMMETRIC = lj.Statistical(symmetric=False), lj.Statistical()

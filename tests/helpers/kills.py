@@ -56,8 +56,8 @@ def prepare(folder: Path) -> None:
 
 def run(folder: Path, words: str) -> "subprocess.Popen[bytes]":
     """The command in a process of its own."""
-    log = (folder / "log.txt").open("wb")
-    return subprocess.Popen([sys.executable, "-m", "fits.cli", *words.split()], cwd=folder, stdout=log, stderr=log)
+    with (folder / "log.txt").open("wb") as log:
+        return subprocess.Popen([sys.executable, "-m", "fits.cli", *words.split()], cwd=folder, stdout=log, stderr=log)
 
 
 def result(folder: Path, name: str) -> Any:

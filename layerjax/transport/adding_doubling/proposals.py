@@ -1,15 +1,157 @@
-"""Directions to draw for any stack: the lobes of paths with one event, and cosine lobes for all that is smooth."""
+"""Directions to draw for any stack.
+
+Of a stack with a base or several interfaces: its lobes by directional statistics, those of the base and of what is
+transmitted included, each by its energy, and cosine lobes for what the solution scatters besides. Of others: the lobes
+of paths with one event, and cosine lobes for all that is smooth.
+"""
+
+from typing import NamedTuple
 
 import jax.numpy as jnp
 from jax import Array
 
+from layerjax._numerics import clamp_max, clamp_min, horizon
+from layerjax.channels import mean
 from layerjax.directions import Vector, flip, sanitise, select
+from layerjax.stack import Stack
 from layerjax.surfaces.interface import interface_pdf, interface_reflection, interface_sample, interface_transmission
 from layerjax.surfaces.lambertian import sample_cosine
+from layerjax.transport.adding_doubling.tables import Tables, read_energies
 from layerjax.transport.first_order import FirstOrder, ReflectingInterface
+from layerjax.transport.lobes.microfacet import MicrofacetLobes, index_below, microfacet_lobes, reference_index
+from layerjax.transport.lobes.sampling import draw_lobe, lobe_density
+from layerjax.transport.lobes.statistics import Options
 from layerjax.transport.single_scattering import SingleScattering
 
 BELOW_ONE = 1.0 - 1e-6
+
+LEAST_DIFFUSE = 0.02
+"""Share of the energy behind the first face that cosine lobes are given at least: lobes are approximate."""
+
+LEAST_LOBE = 1e-4
+"""Energy that every lobe is given at least."""
+
+MEDIA_SHARE = 0.1
+"""Probability of the lobes of single scattering, where media lie on the first interface."""
+
+
+class LayeredState(NamedTuple):
+    """What directions are drawn by of a stack with interfaces. multiple: whether faces return what masking takes."""
+
+    stack: Stack
+    first: FirstOrder
+    tables: Tables
+    multiple: bool
+
+
+class _Mixture(NamedTuple):
+    """Lobes for light from one side, their probabilities, and those of the cosine lobes on its side and the other."""
+
+    lobes: MicrofacetLobes
+    shares: list[Array]
+    near: Array
+    far: Array
+    entry: Array
+    exit: Array
+
+
+def propose_layered(state: LayeredState, wi: Vector, uniforms: tuple[Array, Array, Array]) -> Vector:
+    """Outgoing directions from three uniform numbers each; along the tangent plane where none is."""
+    u, u1, u2 = uniforms
+    media = _media_share(state.first)
+    above = wi[2] > 0
+    lit = jnp.abs(wi[2]) > horizon(wi[2].dtype)
+    inner = u if not media else jnp.clip((u - media) / (1.0 - media), 0.0, BELOW_ONE)
+    wo = _draw(state, wi, (inner, u1, u2), upward=False)
+    if state.first.opaque:
+        lit = lit & above
+    else:
+        wo = select(above, wo, flip(_draw(state, flip(wi), (inner, u1, u2), upward=True)))
+    if media:
+        single = _single_sample(state.first, wi, (jnp.minimum(u / media, BELOW_ONE), u1, u2))
+        wo = select(u < media, single, wo)
+    return _tangent_unless(lit, wo)
+
+
+def layered_density(state: LayeredState, wi: Vector, wo: Vector) -> Array:
+    """Density of `propose_layered` in solid angle, 1/sr."""
+    media = _media_share(state.first)
+    above = wi[2] > 0
+    lit = jnp.abs(wi[2]) > horizon(wi[2].dtype)
+    density = _density(state, wi, wo, upward=False)
+    if state.first.opaque:
+        lit = lit & above
+    else:
+        density = jnp.where(above, density, _density(state, flip(wi), flip(wo), upward=True))
+    if media:
+        density = media * _single_density(state.first, wi, wo) + (1.0 - media) * density
+    return jnp.where(lit, density, 0.0)
+
+
+def _draw(state: LayeredState, wi: Vector, uniforms: tuple[Array, Array, Array], *, upward: bool) -> Vector:
+    """For light above, of the stack turned over if `upward`."""
+    wi = sanitise(wi, wi[2] > horizon(wi[2].dtype))
+    parts = _mixture(state, wi, upward)
+    wo, left = draw_lobe(parts.lobes, parts.shares, wi, uniforms, parts.entry, parts.exit)
+    x, y, z = sample_cosine(*uniforms[1:])
+    beyond = uniforms[0] >= sum(parts.shares, parts.near)
+    turned = select(beyond & (parts.far > 0), (x, y, -z), (x, y, z))
+    return select(left, turned, wo)
+
+
+def _density(state: LayeredState, wi: Vector, wo: Vector, *, upward: bool) -> Array:
+    wi = sanitise(wi, wi[2] > horizon(wi[2].dtype))
+    parts = _mixture(state, wi, upward)
+    density = lobe_density(parts.lobes, parts.shares, wi, wo, parts.entry, parts.exit)
+    return density + jnp.where(wo[2] > 0, parts.near, parts.far) * jnp.abs(wo[2]) / jnp.pi
+
+
+def _mixture(state: LayeredState, wi: Vector, upward: bool) -> _Mixture:
+    """Energies of the lobes by statistics; of what is diffuse: what the solution has behind the face, less those."""
+    stack = state.stack
+    lobes = microfacet_lobes(stack, Options(state.multiple, "orders", False, False), wi[2], upward)
+    energies = [clamp_min(energy, LEAST_LOBE) for energy in lobes.shares()]
+    count = len(lobes.reflected)
+    entered = clamp_min(1.0 - energies[0], 0.0)
+    _, near, far = (mean(part) for part in read_energies(state.tables, flip(wi) if upward else wi))
+    zero = jnp.zeros_like(wi[2])
+
+    def diffuse(share: Array, known: list[Array]) -> Array:
+        energy = entered * clamp_max(clamp_min(share, 0.0), 1.0)
+        return clamp_min(energy - sum(known, zero), LEAST_DIFFUSE * energy + LEAST_LOBE)
+
+    near = diffuse(near, energies[1:count])
+    far = zero if state.first.opaque else diffuse(far, energies[count:])
+    total = sum(energies, near + far)
+    below, reference = index_below(stack), reference_index(stack)
+    entry, exit = below / reference, 1.0 / reference
+    if not upward:
+        entry, exit = exit, entry
+    return _Mixture(lobes, [energy / total for energy in energies], near / total, far / total, entry, exit)
+
+
+def _media_share(first: FirstOrder) -> float:
+    lower = () if first.lower is None else first.lower.media
+    return MEDIA_SHARE if first.upper.media or lower else 0.0
+
+
+def _single_sample(first: FirstOrder, wi: Vector, uniforms: tuple[Array, Array, Array]) -> Vector:
+    """A direction of paths with one event, on the side of the light."""
+    single = SingleScattering()
+    lobe = single.sample(first.upper, wi, uniforms)
+    if first.lower is None:
+        return lobe
+    lobe = select(wi[2] > 0, lobe, flip(single.sample(first.lower, flip(wi), uniforms)))
+    return _tangent_unless(lobe[2] * wi[2] > 0, lobe)  # what a face sends below its horizon is masked
+
+
+def _single_density(first: FirstOrder, wi: Vector, wo: Vector) -> Array:
+    single = SingleScattering()
+    lobe = single.pdf(first.upper, wi, wo)
+    if first.lower is None:
+        return lobe
+    lobe = jnp.where(wi[2] > 0, lobe, single.pdf(first.lower, flip(wi), flip(wo)))
+    return jnp.where(wi[2] * wo[2] > 0, lobe, 0.0)
 
 
 def propose(state: FirstOrder, wi: Vector, uniforms: tuple[Array, Array, Array]) -> Vector:
@@ -28,12 +170,7 @@ def propose(state: FirstOrder, wi: Vector, uniforms: tuple[Array, Array, Array])
         wo = select(u < lobes + facets, _tangent_unless(leaves, refracted), wo)
     wo = select(above, wo, flip(wo))
     inner = (jnp.minimum(u / lobes, BELOW_ONE), u1, u2)
-    single = SingleScattering()
-    lobe = single.sample(state.upper, wi, inner)
-    if state.lower is not None:
-        lobe = select(above, lobe, flip(single.sample(state.lower, flip(wi), inner)))
-        lobe = _tangent_unless(lobe[2] * wi[2] > 0, lobe)  # what a face sends below its horizon is masked
-    return select(u < lobes, lobe, wo)
+    return select(u < lobes, _single_sample(state, wi, inner), wo)
 
 
 def proposal_density(state: FirstOrder, wi: Vector, wo: Vector) -> Array:
@@ -41,12 +178,7 @@ def proposal_density(state: FirstOrder, wi: Vector, wo: Vector) -> Array:
     lobes, facets, near, far = _shares(state)
     above = wi[2] > 0
     same = wi[2] * wo[2] > 0
-    single = SingleScattering()
-    lobe = single.pdf(state.upper, wi, wo)
-    if state.lower is not None:
-        lobe = jnp.where(above, lobe, single.pdf(state.lower, flip(wi), flip(wo)))
-        lobe = jnp.where(same, lobe, 0.0)
-    density = lobes * lobe + jnp.where(same, near, far) * jnp.abs(wo[2]) / jnp.pi
+    density = lobes * _single_density(state, wi, wo) + jnp.where(same, near, far) * jnp.abs(wo[2]) / jnp.pi
     if state.crossing is not None:
         up, out = select(above, wi, flip(wi)), select(above, wo, flip(wo))
         face = state.crossing
@@ -62,7 +194,10 @@ def _shares(state: FirstOrder) -> tuple[float, float, float, float]:
     """Probabilities of lobes of media and faces, of a single interface, and of two cosine lobes, wi's side first."""
     if state.opaque:
         return 0.6, 0.0, 0.4, 0.0
-    return (0.5, 0.0, 0.25, 0.25) if state.crossing is None else (0.3, 0.4, 0.15, 0.15)
+    if state.crossing is None:
+        return 0.5, 0.0, 0.25, 0.25
+    # an interface alone is drawn as it scatters; what it returns of the light lost to masking is smooth
+    return (0.3, 0.4, 0.15, 0.15) if _media_share(state) else (0.02, 0.9, 0.04, 0.04)
 
 
 def _tangent_unless(leaves: Array, w: Vector) -> Vector:

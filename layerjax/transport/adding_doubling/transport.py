@@ -42,7 +42,13 @@ from layerjax.transport.adding_doubling.elements import (
 )
 from layerjax.transport.adding_doubling.energies import clip_negative, directional_albedo
 from layerjax.transport.adding_doubling.moments import delta_scale
-from layerjax.transport.adding_doubling.proposals import proposal_density, propose
+from layerjax.transport.adding_doubling.proposals import (
+    LayeredState,
+    layered_density,
+    proposal_density,
+    propose,
+    propose_layered,
+)
 from layerjax.transport.adding_doubling.requested_directions import RequestedValues, read_requested, requested_values
 from layerjax.transport.adding_doubling.resolution import (
     ASSUMED_WIDTH,
@@ -99,11 +105,13 @@ class AddingDoublingState(eqx.Module):
     """A solved stack: what is evaluated in closed form, and the rest: tables, or values between known directions.
 
     Both are None if there is no rest. ballistic: what passes two interfaces, in neither. scaled_first: what the rest
-    lacks in the place of `first`, in media as the grid has them (see `moments`); None: `first` itself.
+    lacks in the place of `first`, in media as the grid has them (see `moments`); None: `first` itself. stack: one by
+    whose lobes directions are drawn (see `proposals`).
     """
 
     first: FirstOrder
     tables: Tables | None
+    stack: Stack | None = None
     requested: RequestedValues | None = None
     ballistic: Ballistic | None = None
     scaled_first: FirstOrder | None = None
@@ -224,7 +232,9 @@ class AddingDoubling(DeterministicTransport):
             return AddingDoublingState(first, None)
         plan = self._plan(stack, None)
         carried, once = _scale_stack(stack, plan)
-        return AddingDoublingState(first, self._solve(stack, first, once, plan), None, ballistic_paths(carried), once)
+        layered = stack if first.layered and first.crossing is None else None
+        tables = self._solve(stack, first, once, plan)
+        return AddingDoublingState(first, tables, layered, None, ballistic_paths(carried), once)
 
     def traceable_equivalent(self, stack: Stack, known: DirectionLookup) -> "AddingDoubling":
         found = requested_stack(stack, known) if self.orders != "first" else None
@@ -249,7 +259,7 @@ class AddingDoubling(DeterministicTransport):
         plan = self._plan(closed, directions)
         rest = self._solve_requested(closed, directions, plan)
         carried, once = _scale_stack(closed, plan)
-        return AddingDoublingState(first_order(closed), None, rest, ballistic_paths(carried), once)
+        return AddingDoublingState(first_order(closed), None, None, rest, ballistic_paths(carried), once)
 
     def evaluate_batch(
         self, state: AddingDoublingState, wi: Array, wo: Array, side: Side, channels: int, key: Array | None
@@ -310,10 +320,17 @@ class AddingDoubling(DeterministicTransport):
         return total(parts)
 
     def sample(self, state: AddingDoublingState, wi: Vector, uniforms: tuple[Array, Array, Array]) -> Vector:
-        return propose(state.first, wi, uniforms)
+        layered = self._layered(state)
+        return propose(state.first, wi, uniforms) if layered is None else propose_layered(layered, wi, uniforms)
 
     def pdf(self, state: AddingDoublingState, wi: Vector, wo: Vector) -> Array:
-        return proposal_density(state.first, wi, wo)
+        layered = self._layered(state)
+        return proposal_density(state.first, wi, wo) if layered is None else layered_density(layered, wi, wo)
+
+    def _layered(self, state: AddingDoublingState) -> LayeredState | None:
+        if state.stack is None or state.tables is None:
+            return None
+        return LayeredState(state.stack, state.first, state.tables, self.facet_multiple_scattering)
 
     def albedo(self, state: AddingDoublingState, wi: Vector, nodes: int) -> tuple[Channels, Channels]:
         """What the first face does by quadrature with `nodes` points, and of the rest what the nodes scatter: lossless

@@ -31,7 +31,7 @@ from layerjax.microsurface.energy_tables import index_variable
 from layerjax.microsurface.splines import taps, weights
 from layerjax.quadrature import gauss_legendre, panels
 from layerjax.tables import load
-from layerjax.transport.statistical.variance import bounded_refracted_cosine, roughness, transmission_scale, variance
+from layerjax.transport.lobes.variance import bounded_refracted_cosine, roughness, transmission_scale, variance
 
 Table = Mapping[str, np.ndarray]
 

@@ -35,8 +35,8 @@ from layerjax.transport.adding_doubling.operators import Parts
 from layerjax.transport.adding_doubling.resolution import Resolution
 from layerjax.transport.adding_doubling.solve import Plan, make_plan, solve
 from layerjax.transport.first_order import collision_probability
+from layerjax.transport.lobes.statistics import precision
 from layerjax.transport.statistical.diffuse import closed_form, indirect_energy
-from layerjax.transport.statistical.lobes import precision
 
 NODES = 24
 """Cosines of the solver, and of means over diffuse light."""

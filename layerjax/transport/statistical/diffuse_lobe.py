@@ -18,9 +18,9 @@ from layerjax.directions import Vector, sanitise
 from layerjax.stack import Interface, Medium, Stack, is_known
 from layerjax.surfaces import Lambertian
 from layerjax.transport.adding_doubling.interpolate import cubic
+from layerjax.transport.lobes.microfacet import GRAZING
+from layerjax.transport.lobes.statistics import precision
 from layerjax.transport.statistical.diffuse import Coat, indirect_lobe, stack_lobe
-from layerjax.transport.statistical.lobes import precision
-from layerjax.transport.statistical.microfacet_lobes import GRAZING
 
 POINTS = 97
 """Cosines of a table, uniform in the angle above the horizon."""

@@ -13,10 +13,10 @@ from layerjax._numerics import clamp_min, exprel
 from layerjax.channels import Channels, map_channels, multiply, per_channel
 from layerjax.stack import Interface, Medium, Stack
 from layerjax.surfaces import Lambertian
+from layerjax.transport.lobes.statistics import precision
 from layerjax.transport.statistical import stream_layers, streams
 from layerjax.transport.statistical.coated_base import CoatedBase, is_coated, make_coated
 from layerjax.transport.statistical.diffuse import closed_form, indirect_energy
-from layerjax.transport.statistical.lobes import precision
 from layerjax.transport.statistical.streamed_base import ClosedForm, StreamedBase, absorbs, make_streamed
 
 

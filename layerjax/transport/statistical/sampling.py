@@ -6,17 +6,16 @@ from jax import Array
 
 from layerjax._numerics import horizon, safe_div
 from layerjax.channels import Channels
-from layerjax.directions import Vector, flip, half_vector, reflect, sanitise, select
-from layerjax.normals.facets import reflection_pdf
-from layerjax.normals.ggx import ggx_sample
+from layerjax.directions import Vector, sanitise, select
 from layerjax.surfaces import Surface
 from layerjax.surfaces.lambertian import sample_cosine
+from layerjax.transport.lobes.microfacet import MicrofacetLobes
+from layerjax.transport.lobes.sampling import draw_lobe, lobe_density
 from layerjax.transport.single_scattering import Media, SingleScattering
 from layerjax.transport.statistical.coated_base import CoatedBase
 from layerjax.transport.statistical.diffuse_base import DiffuseBase
 from layerjax.transport.statistical.diffuse_lobe import DiffuseLobe
 from layerjax.transport.statistical.hazy_base import HazyBase
-from layerjax.transport.statistical.microfacet_lobes import MicrofacetLobes, fold, unfold
 from layerjax.transport.statistical.streamed_base import StreamedBase
 
 DiffusePart = DiffuseBase | CoatedBase | StreamedBase | HazyBase | DiffuseLobe | Surface
@@ -35,28 +34,13 @@ def draw(
 
     entry, exit: indices before and behind over that of the folded medium.
     """
-    u, u1, u2 = uniforms
     valid = wi[2] > horizon(wi[2].dtype)
     wi = sanitise(wi, valid)
-    shares = _probabilities(lobes, diffuse, wi)
-    reflected, transmitted = lobes.widths()
-    alpha, passes, scatters = jnp.ones_like(u), jnp.zeros(u.shape, bool), jnp.ones(u.shape, bool)
-    reached = jnp.zeros_like(u)
-    for index, width in enumerate(reflected + transmitted):
-        chosen = scatters & (u < reached + shares[index]) & (u >= reached)
-        reached = reached + shares[index]
-        alpha = jnp.where(chosen, width, alpha)
-        passes = passes | (chosen & (index >= len(reflected)))
-        scatters = scatters & ~chosen
     # what no lobe took is diffuse; where nothing is diffuse that is rounding, and drawn from a lobe of width 1
-    light = wi if not transmitted else select(passes, fold(wi, entry), wi)
-    wo = reflect(light, ggx_sample(light, alpha, u1, u2))
-    if transmitted:
-        wo = select(passes, unfold(wo, exit), wo)
+    wo, scatters = draw_lobe(lobes, _probabilities(lobes, diffuse, wi), wi, uniforms, entry, exit)
     if diffuse is not None:
-        wo = select(scatters, sample_cosine(u1, u2), wo)
-    lost = ~valid | (~passes & (wo[2] < 0))
-    return (wo[0], wo[1], jnp.where(lost, 0.0, wo[2]))
+        wo = select(scatters, sample_cosine(*uniforms[1:]), wo)
+    return (wo[0], wo[1], jnp.where(valid, wo[2], 0.0))
 
 
 def density(
@@ -67,27 +51,11 @@ def density(
     lit = wi[2] > edge
     wi = sanitise(wi, lit)
     shares = _probabilities(lobes, diffuse, wi)
-    reflected, transmitted = lobes.widths()
-    above = wo[2] > edge
-    up = sanitise(wo, above)
-    h, _ = half_vector(wi, up, same_side=True)
-    rest = 1.0 - sum(shares[: len(reflected) + len(transmitted)], jnp.zeros_like(wi[2]))
-    total = jnp.zeros_like(wi[2] * wo[2])
-    for share, alpha in zip(shares, reflected, strict=False):
-        total = total + share * reflection_pdf(h, wi, alpha)
+    total = lobe_density(lobes, shares, wi, wo, entry, exit)
     if diffuse is not None:
-        total = total + rest * up[2] / np.pi
-    total = jnp.where(above, total, 0.0)
-    if transmitted:
-        below = wo[2] < -edge
-        under = sanitise(flip(wo), below)
-        a, b = fold(wi, entry), fold(under, exit)
-        below = below & (a[2] > edge) & (b[2] > edge)
-        a, b = sanitise(a, below), sanitise(b, below)
-        h, _ = half_vector(a, b, same_side=True)
-        stretch = exit * exit * under[2] / b[2]
-        for share, alpha in zip(shares[len(reflected) :], transmitted, strict=False):
-            total = total + jnp.where(below, share * stretch * reflection_pdf(h, a, alpha), 0.0)
+        above = wo[2] > edge
+        rest = 1.0 - sum(shares, jnp.zeros_like(wi[2]))
+        total = total + jnp.where(above, rest * jnp.where(above, wo[2], 0.0) / np.pi, 0.0)
     return jnp.where(lit, total, 0.0)
 
 

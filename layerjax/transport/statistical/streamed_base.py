@@ -26,9 +26,9 @@ from layerjax.channels import Channels, map_channels, multiply, per_channel, sel
 from layerjax.directions import Vector, sanitise
 from layerjax.stack import Interface, Medium, Stack, is_known
 from layerjax.surfaces import Lambertian
+from layerjax.transport.lobes.statistics import precision
 from layerjax.transport.statistical import stream_layers, streams
 from layerjax.transport.statistical.diffuse import closed_form, indirect_energy
-from layerjax.transport.statistical.lobes import precision
 
 BEAM, TURNED = 0.01, 0.001
 """Variances of the cosine of light at which it is half a beam: to the second interface, and once that has reflected it.

@@ -30,12 +30,7 @@ from layerjax.surfaces import Conductor, Surface
 from layerjax.surfaces.interface import interface_reflection
 from layerjax.transport.contract import TEXELS, DeterministicTransport, Side, refuse_film, require_ggx
 from layerjax.transport.known_directions import DirectionLookup
-from layerjax.transport.statistical.coated_base import is_coated, make_coated
-from layerjax.transport.statistical.diffuse_base import make_diffuse
-from layerjax.transport.statistical.diffuse_lobe import make_diffuse_lobe, why_no_lobe
-from layerjax.transport.statistical.hazy_base import is_hazy, make_hazy
-from layerjax.transport.statistical.lobes import Options, Scattering, bound_alpha, smooth_parts
-from layerjax.transport.statistical.microfacet_lobes import (
+from layerjax.transport.lobes.microfacet import (
     Facet,
     MicrofacetLobes,
     fold,
@@ -44,6 +39,11 @@ from layerjax.transport.statistical.microfacet_lobes import (
     reference_index,
     unfold,
 )
+from layerjax.transport.lobes.statistics import Options, Scattering, bound_alpha, smooth_parts
+from layerjax.transport.statistical.coated_base import is_coated, make_coated
+from layerjax.transport.statistical.diffuse_base import make_diffuse
+from layerjax.transport.statistical.diffuse_lobe import make_diffuse_lobe, why_no_lobe
+from layerjax.transport.statistical.hazy_base import is_hazy, make_hazy
 from layerjax.transport.statistical.sampling import (
     DiffusePart,
     density,

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 import layerjax as lj
-from layerjax.transport.statistical.lobes import Options, lobe_roughness, statistics
-from layerjax.transport.statistical.microfacet_lobes import microfacet_lobes
-from layerjax.transport.statistical.variance import phase_variance, roughness
+from layerjax.transport.lobes.microfacet import microfacet_lobes
+from layerjax.transport.lobes.statistics import Options, lobe_roughness, statistics
+from layerjax.transport.lobes.variance import phase_variance, roughness
 from tests.helpers.compiled import compiled
 from tests.helpers.sampling import chi_square
 

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from layerjax.transport.statistical.adding import (
+from layerjax.transport.lobes.adding import (
     Element,
     Orders,
     add_element,
@@ -17,7 +17,7 @@ from layerjax.transport.statistical.adding import (
     multiply_orders,
     sum_orders,
 )
-from layerjax.transport.statistical.variance import (
+from layerjax.transport.lobes.variance import (
     bounded_refracted_cosine,
     phase_variance,
     roughness,

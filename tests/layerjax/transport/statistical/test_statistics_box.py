@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import layerjax as lj
-from layerjax.transport.statistical.lobes import Options, statistics
+from layerjax.transport.lobes.statistics import Options, statistics
 from tests.helpers.derivatives import with_slopes
 
 INTERFACES, COUNT = 10, 24

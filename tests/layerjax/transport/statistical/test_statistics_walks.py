@@ -7,7 +7,7 @@ import pytest
 
 import layerjax as lj
 from benchmarks.studies.statistics import cases, compare
-from layerjax.transport.statistical.lobes import Options, statistics
+from layerjax.transport.lobes.statistics import Options, statistics
 
 LIGHT = lj.direction(jnp.radians(jnp.array([0.0, 60.0])), 0.0)
 FORWARD = Options(True, "orders", angles=False, own_side=False)

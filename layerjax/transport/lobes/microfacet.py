@@ -16,7 +16,7 @@ from layerjax.directions import Vector
 from layerjax.microsurface.energy_tables import escape_cone_share, mirror_energy, single_reflectance
 from layerjax.stack import Interface, Stack
 from layerjax.surfaces import Conductor
-from layerjax.transport.statistical.lobes import (
+from layerjax.transport.lobes.statistics import (
     STEEPEST,
     Options,
     Statistics,
@@ -26,7 +26,7 @@ from layerjax.transport.statistical.lobes import (
     precision,
     statistics,
 )
-from layerjax.transport.statistical.variance import bounded_refracted_cosine
+from layerjax.transport.lobes.variance import bounded_refracted_cosine
 
 LEAST_ENERGY = 1e-6
 """Least energy of an unscaled lobe that is divided by."""

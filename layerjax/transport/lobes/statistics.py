@@ -1,7 +1,7 @@
 """The lobes of a stack: one for each interface and base that reflects, and one that passes through all.
 
 Statistics of the atomic operators (Belcour 2018, Sec. 4) for light along given cosines, put together by
-`layerjax.transport.statistical.adding`.
+`layerjax.transport.lobes.adding`.
 """
 
 from collections.abc import Sequence
@@ -20,8 +20,8 @@ from layerjax.microsurface.directional_albedo import is_smooth
 from layerjax.microsurface.energy_tables import conductor_energies, escape_cone_share, interface_energies
 from layerjax.stack import Interface, Medium, Stack, is_known
 from layerjax.surfaces import Conductor
-from layerjax.transport.statistical.adding import Element, Lobe, add_element, identity, limit_escape
-from layerjax.transport.statistical.variance import (
+from layerjax.transport.lobes.adding import Element, Lobe, add_element, identity, limit_escape
+from layerjax.transport.lobes.variance import (
     bounded_refracted_cosine,
     phase_variance,
     roughness,
