@@ -197,7 +197,7 @@ def _shares(state: FirstOrder) -> tuple[float, float, float, float]:
     if state.crossing is None:
         return 0.5, 0.0, 0.25, 0.25
     # an interface alone is drawn as it scatters; what it returns of the light lost to masking is smooth
-    return (0.3, 0.4, 0.15, 0.15) if _media_share(state) else (0.02, 0.9, 0.04, 0.04)
+    return (0.3, 0.4, 0.15, 0.15) if _media_share(state) else (0.02, 0.94, 0.02, 0.02)
 
 
 def _tangent_unless(leaves: Array, w: Vector) -> Vector:
