@@ -1,4 +1,4 @@
-"""What tests of rough interfaces ask whatever the distribution of their normals: energies, and pairs of directions."""
+"""What tests of rough interfaces ask whatever the distribution of their normals: energies, pairs, a rule of normals."""
 
 from functools import partial
 
@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+import layerjax as lj
 from layerjax.directions import split
 from layerjax.surfaces.interface import interface_reflection, interface_transmission
 
@@ -44,3 +45,16 @@ def pairs(random, count, alphas, dtype=np.float64):
     wo[:, 2::62] = np.array([[0], [0], [1]])
     ior, alpha = random.choice(INDICES, count), random.choice(alphas, count)
     return tuple(wi.astype(dtype)), tuple(wo.astype(dtype)), ior.astype(dtype), alpha.astype(dtype)
+
+
+def sphere(nodes):
+    """A product rule on the sphere, crowded towards the z axis and the plane across it, where narrow lobes sit."""
+    s, w = np.polynomial.legendre.leggauss(nodes)
+    t, w = 0.5 * (s + 1.0), 0.5 * w
+    # cos = t^4-like clustering from both ends of [0, 1]
+    z = t**4 / (t**4 + (1 - t) ** 4)
+    dz = 4 * t**3 * (1 - t) ** 3 / (t**4 + (1 - t) ** 4) ** 2
+    z, w = np.concatenate([z, -z]), np.tile(w * dz, 2)
+    phi = 2 * np.pi * (np.arange(nodes) + 0.5) / nodes
+    m = np.asarray(lj.direction(np.arccos(z)[:, None], phi))
+    return m, np.broadcast_to(w[:, None] * 2 * np.pi / nodes, m.shape[:-1])

@@ -8,19 +8,7 @@ import layerjax as lj
 from layerjax.directions import normalize, split
 from layerjax.normals.ggx import ggx_density, ggx_masking
 from layerjax.normals.sggx import sggx_area, sggx_density
-
-
-def sphere(nodes, axis=None):
-    """A product rule on the sphere, crowded towards the z axis and the plane across it, where narrow lobes sit."""
-    s, w = np.polynomial.legendre.leggauss(nodes)
-    t, w = 0.5 * (s + 1.0), 0.5 * w
-    # cos = t^4-like clustering from both ends of [0, 1]
-    z = t**4 / (t**4 + (1 - t) ** 4)
-    dz = 4 * t**3 * (1 - t) ** 3 / (t**4 + (1 - t) ** 4) ** 2
-    z, w = np.concatenate([z, -z]), np.tile(w * dz, 2)
-    phi = 2 * np.pi * (np.arange(nodes) + 0.5) / nodes
-    m = np.asarray(lj.direction(np.arccos(z)[:, None], phi))
-    return m, np.broadcast_to(w[:, None] * 2 * np.pi / nodes, m.shape[:-1])
+from tests.helpers.interfaces import sphere
 
 
 @pytest.mark.parametrize("kind", ["surface", "fiber"])

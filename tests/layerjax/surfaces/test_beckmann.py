@@ -14,9 +14,8 @@ from layerjax.directions import split
 from layerjax.normals import facets
 from layerjax.surfaces.interface import interface_pdf, interface_reflection, interface_sample, interface_transmission
 from tests.helpers.derivatives import with_slopes
-from tests.helpers.interfaces import pairs
+from tests.helpers.interfaces import pairs, sphere
 from tests.helpers.sampling import DRAWS, SIGNIFICANCE, chi_square
-from tests.layerjax.normals.test_distributions import sphere
 
 KIND = "beckmann"
 MIRROR = (0.01, 20.0)  # of index 1 reflects 0.9999 of the light
