@@ -1,5 +1,6 @@
 """Directions drawn for stacks with interfaces: by the density that is stated, also behind the first face, evenly."""
 
+import itertools
 from functools import partial
 
 import jax
@@ -29,7 +30,11 @@ STACKS = {
 }
 LAYERED = [kind for kind in STRUCTURES if kind not in ("flakes", "haze on metal")]
 RANDOM = {f"{kind} {seed}": STRUCTURES[kind][1](drawn(kind, seed)) for kind in LAYERED for seed in range(6)}
-QUICK = ("coated metal", "slab")
+QUICK = ("coated metal", 1.2)
+CASES = [
+    pytest.param(*case, marks=() if case == QUICK else pytest.mark.slow)
+    for case in itertools.product(STACKS | RANDOM, (0.4, 1.2))
+]
 KEY, WEIGHTS = jax.random.key(3), 20_000
 
 LARGEST = 30.0
@@ -55,10 +60,7 @@ def directions(prepared, count, wi):
     return jnp.stack(prepared.transport.sample(prepared.state, towards, jax.random.uniform(KEY, (3, count))), axis=-1)
 
 
-@pytest.mark.parametrize("theta", [0.4, 1.2])
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=() if name in QUICK else pytest.mark.slow) for name in STACKS | RANDOM]
-)
+@pytest.mark.parametrize(("name", "theta"), CASES)
 def test_directions_are_drawn_by_their_density_and_evenly(name, theta):
     """From above, and where light passes from below at the steeper angle."""
     stack = (STACKS | RANDOM)[name]
