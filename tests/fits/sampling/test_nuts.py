@@ -94,4 +94,4 @@ def test_the_command_samples_with_it(work: Path, coat_fit: Fit, layerjax: Callab
     posterior = load_posterior("result")
     assert posterior is not None
     assert posterior.chain.shape[:2] == (200, 4)
-    assert "(sampler nuts, not emcee, walkers 4, not 32)" in layerjax("sample result --sampler emcee", 2).err
+    assert "(sampler nuts, not emcee, walkers 4, not 20)" in layerjax("sample result --sampler emcee", 2).err
