@@ -64,8 +64,9 @@ def result(folder: Path, name: str) -> Any:
     """The numbers that a command has left, and what lies beside them."""
     beside = sorted(os.listdir(folder))
     if name == "sample":
-        blocks = Store.read(folder / "result/chain.db").all("steps")
-        return beside, np.concatenate([block["coords"] for block in blocks]).tobytes()
+        path = folder / "result/chain.db"
+        blocks = Store.read(path).all("steps") if path.exists() else []
+        return beside, b"".join(np.ascontiguousarray(block["coords"]).tobytes() for block in blocks)
     out = folder / {"fit": "fitted", "search": "stacks", "fit-many": "many", "fit-map": "map.zarr"}[name]
     found = [path for path in out.rglob("*" if name == "fit-map" else "fit.json") if path.is_file()]
     return beside, {str(path.relative_to(out)): path.read_bytes() for path in found}
