@@ -71,7 +71,9 @@ def cauchy(wavelengths_nm: ArrayLike, a: ArrayLike, b: ArrayLike, c: ArrayLike =
 
     Example:
         >>> import layerjax as lj
-        >>> lj.cauchy([610.0, 550.0, 465.0], 1.4787, 0.00455).round(4).tolist()  # acrylic: n_D 1.492, Abbe number 57
+        >>> acrylic = lj.cauchy([610.0, 550.0, 465.0], 1.4787, 0.00455)  # n_D 1.492, Abbe number 57
+        >>> [f"{n:.3f}" for n in acrylic.tolist()]
+        ['1.491', '1.494', '1.500']
     """
     square = (as_floating("wavelengths_nm", wavelengths_nm) * 1e-3) ** 2
     return as_floating("a", a) + as_floating("b", b) / square + as_floating("c", c) / (square * square)
