@@ -10,6 +10,7 @@ from layerjax.evaluate import evaluate as evaluate
 from layerjax.evaluate import evaluate_with_error as evaluate_with_error
 from layerjax.evaluate import pdf as pdf
 from layerjax.evaluate import sample as sample
+from layerjax.evaluate import specular as specular
 from layerjax.evaluate import unscattered as unscattered
 from layerjax.mixture import Mixture as Mixture
 from layerjax.optical_constants import cauchy as cauchy

@@ -83,13 +83,14 @@ def parameter(
     default: Any = dataclasses.MISSING,
     optional: bool = False,
     ranged: bool = True,
+    absent_at_zero: bool = False,
     limits: tuple[float, float] | None = None,
 ) -> Any:
     """A dataclass field called `name` ("Class.field"), converted to a floating array and checked against `RANGES`.
 
     Traced values are not checked (they have no value yet), placeholders pass as they are. Not `ranged`: the range
-    depends on other fields, and is checked by the class. `limits`: the range of a class that is not in `RANGES`, such
-    as one's own; it joins them.
+    depends on other fields, and is checked by the class. `absent_at_zero`: a known 0 is None, by structure. `limits`:
+    the range of a class that is not in `RANGES`, such as one's own; it joins them.
     """
     if limits is not None:
         RANGES[name] = limits
@@ -98,6 +99,8 @@ def parameter(
         if (optional and value is None) or is_placeholder(value):
             return value
         array = _check_shape(name, value)
+        if absent_at_zero and not isinstance(array, jax.core.Tracer) and not np.any(np.asarray(array)):
+            return None
         if ranged:
             check_range(name, array)
         return array

@@ -165,7 +165,7 @@ def require_single(stack: Any, who: str) -> None:
         number = next(number for number in numbers_of(stack) if number.map_axes)
         raise ValueError(
             f"stack: {who} takes one stack; {number.name} of shape {number.shape} makes it a map of stacks, "
-            "which evaluate, sample, pdf, albedo and unscattered take"
+            "which evaluate, sample, pdf, albedo, specular and unscattered take"
         )
 
 

@@ -192,6 +192,22 @@ def reflect(w: Vector, m: Vector) -> Vector:
     return (2 * cosine * m[0] - w[0], 2 * cosine * m[1] - w[1], 2 * cosine * m[2] - w[2])
 
 
+def mirror(w: Vector) -> Vector:
+    """The mirror direction about the normal."""
+    return -w[0], -w[1], w[2]
+
+
+def bend(w: Vector, ior: Array) -> tuple[Vector, Array]:
+    """Direction, on the same side, of a ray along w where the index is `ior` times as large, and whether it exists.
+
+    What a path keeps as it crosses smooth interfaces; along the tangent plane where it does not exist.
+    """
+    squared = squared_cosine_of_refraction(w[2], ior)
+    exists = squared > 0
+    cosine = jnp.where(exists, jnp.sqrt(jnp.where(exists, squared, 1.0)), 0.0)
+    return (w[0] / ior, w[1] / ior, jnp.where(w[2] < 0, -cosine, cosine)), exists
+
+
 def squared_cosine_of_refraction(cosine: Array, ior: Array) -> Array:
     """Squared cosine of refraction by Snell's law, below 0 under total reflection; exactly cosine^2 where ior is 1.
 

@@ -1,4 +1,4 @@
-"""The public way in: evaluate, evaluate_with_error, sample, pdf, albedo, unscattered; `prepare` lies beside it.
+"""The public way in: evaluate, evaluate_with_error, sample, pdf, albedo, specular, unscattered; `prepare` is beside it.
 
 Everything here is a pure function of arrays, compiled once per structure and shape, and usable inside ``jit``,
 ``vmap`` and ``grad``. Large batches run in chunks that fit the cache; a chunk is computed again on the way back, so
@@ -37,6 +37,7 @@ from layerjax.preparation import (
 )
 from layerjax.stack import Stack, media_of, optical_depths, require_numbers, simplify
 from layerjax.transport import Side, Transport
+from layerjax.transport.contract import Draws
 from layerjax.transport.known_directions import (
     MOST_COSINES,
     DirectionLookup,
@@ -45,6 +46,7 @@ from layerjax.transport.known_directions import (
     known_directions,
     separate_cosines,
 )
+from layerjax.transport.specular import specular_shares
 
 
 def evaluate(
@@ -176,7 +178,20 @@ def sample(
         ``wo`` of shape ``(..., 3)``; its density ``pdf`` in 1/sr, shape ``(...)``; and ``weight = f |cos_o| / pdf``
         of shape ``(..., C)``, whose mean is the albedo. Draws without light, for example below an opaque base, have
         weight 0; a draw without a direction is in the tangent plane.
+
+        Smooth surfaces are drawn as in Mitsuba and pbrt: ``wo`` is then exactly the mirror or the refracted direction,
+        ``pdf`` the probability of that draw (no density), and ``weight`` the energy of `specular` over it. `evaluate`
+        and `pdf` know nothing of the delta there.
     """
+    drawn = draw(stack, wi, key, transport)
+    return drawn.wo, drawn.density, drawn.weight
+
+
+@allow_broadcasting
+def draw(
+    stack: Stack | Mixture | Prepared, wi: ArrayLike, key: Array, transport: Transport | Literal["auto"] = "auto"
+) -> Draws:
+    """`sample`, and which draws are along a delta. Not public."""
     require_key(key)
     (wi,) = read_directions(wi=wi)
     if isinstance(stack, Mixture):
@@ -217,9 +232,10 @@ def albedo(
 ) -> tuple[Array, Array]:
     """Directional albedo: the shares of light along wi that are reflected and transmitted, ``(..., C)`` each.
 
-    Ballistic light is not included (see `unscattered`). The BSDF is integrated by quadrature that is adapted to each
-    lobe, with `nodes` Gauss points per dimension and panel. The error with 32 is 1e-6 as a rule, and 4e-3 at worst, for
-    grazing light and lobes of alpha 1e-4. `RandomWalk` counts paths instead, and needs a `key`.
+    The delta part is not included: see `specular` and, of media alone, `unscattered`. The BSDF is integrated by
+    quadrature that is adapted to each lobe, with `nodes` Gauss points per dimension and panel. The error with 32 is
+    1e-6 as a rule, and 4e-3 at worst, for grazing light and lobes of alpha 1e-4. `RandomWalk` counts paths instead, and
+    needs a `key`.
 
     Maps of stacks as in `evaluate`.
     """
@@ -242,8 +258,8 @@ def albedo(
 def unscattered(stack: Stack | Mixture, wi: ArrayLike) -> Array:
     """Share of radiance along wi that passes the stack without a collision, shape ``(..., C)``.
 
-    This is the delta component of the BSDF. It is 0 over an opaque base and through rough interfaces. Maps of stacks as
-    in `evaluate`.
+    This is the delta component of the BSDF of media alone. It is 0 over an opaque base and through interfaces, of which
+    smooth ones have `specular`. Maps of stacks as in `evaluate`.
     """
     require_material(stack)
     require_numbers(stack)
@@ -254,6 +270,42 @@ def unscattered(stack: Stack | Mixture, wi: ArrayLike) -> Array:
     if shape:
         return maps.evaluate_texels(_unscattered, slim, maps.layout(shape, wi), wi, channels)
     return _unscattered(slim, wi, channels)
+
+
+@allow_broadcasting
+def specular(stack: Stack | Mixture, wi: ArrayLike) -> tuple[Array, Array]:
+    """Energies of the delta part of the BSDF: what is reflected along the mirror direction, and what is transmitted
+    along the refracted one, of light along wi, shape ``(..., C)`` each.
+
+    They hold all reflections to and fro between smooth interfaces, and the attenuation by media, in closed form. They
+    are 0 where the first surface that light meets is rough, and beyond any rough surface. Without surfaces the second
+    is `unscattered`. Of a lossless stack they and both parts of `albedo` sum to 1. Maps of stacks as in `evaluate`.
+
+    Args:
+        stack: the layered material.
+        wi: unit directions towards the light, shape ``(..., 3)``; below the horizon it falls on the stack from below.
+
+    Raises:
+        ValueError: the stack holds a placeholder, or directions are not of unit length.
+
+    Example:
+        >>> import layerjax as lj
+        >>> pane = lj.Stack([lj.Interface(ior=1.5), lj.Interface(ior=1.0)])
+        >>> reflected, transmitted = lj.specular(pane, lj.direction(0.0, 0.0))
+        >>> print(reflected.round(4), transmitted.round(4))
+        [0.0769] [0.9231]
+    """
+    require_material(stack)
+    require_numbers(stack)
+    (wi,) = read_directions(wi=wi)
+    if isinstance(stack, Mixture):
+        return _broadcast_parts(stack).mean(lambda part, _: specular(part, wi))
+    slim, channels, shape = cast_arrays(simplify(stack), wi.dtype), channel_count(stack), map_shape(stack)
+    if shape:
+        found = maps.evaluate_texels(_specular, slim, maps.layout(shape, wi), wi, channels)
+    else:
+        found = _specular(slim, wi, channels)
+    return found[..., :channels], found[..., channels:]
 
 
 def _evaluate_whole(inputs: tuple[Stack, Transport, KnownDirections | None, Array, Array, Side, int]) -> Array:
@@ -268,7 +320,7 @@ def _evaluate(prepared: Prepared, wi: Array, wo: Array, side: Side, key: Array |
 
 
 @compile_for_devices
-def _sample(prepared: Prepared, wi: Array, key: Array) -> tuple[Array, Array, Array]:
+def _sample(prepared: Prepared, wi: Array, key: Array) -> Draws:
     return prepared.transport.sample_batch(prepared.state, wi, prepared.channels, key)
 
 
@@ -297,6 +349,13 @@ def _unscattered(stack: Stack, wi: Array, channels: int) -> Array:
     return jnp.stack([jnp.where(visible, jnp.exp(-total), 0.0) for total in totals], axis=-1)
 
 
+@compile_for_devices
+def _specular(stack: Stack, wi: Array, channels: int) -> Array:
+    """Reflected and transmitted, (..., 2 channels)."""
+    sides = specular_shares(stack, split(wi))
+    return jnp.stack([pick(side, c) for side in sides for c in range(channels)], axis=-1)
+
+
 def _broadcast_parts(mixture: Mixture) -> Mixture:
     require_numbers(mixture)
     return mixture.broadcast_parts(map_shape(mixture))
@@ -322,24 +381,39 @@ def _is_random(material: Any, transport: Any) -> bool:
     return isinstance(chosen, Transport) and chosen.random
 
 
-def _sample_mixture(mixture: Mixture, wi: Array, key: Array, transport: Any) -> tuple[Array, Array, Array]:
-    """A draw from every part, of which one is chosen by weight: its density is the mean of all."""
+def _sample_mixture(mixture: Mixture, wi: Array, key: Array, transport: Any) -> Draws:
+    """A draw from every part, of which one is chosen by weight: its density is the mean of all. A delta is its part's
+    own: the others that have one there draw it as often as they are chosen."""
     shape = map_shape(mixture)
     mixture = _broadcast_parts(mixture) if shape else prepare(mixture, transport)
     wi = jnp.broadcast_to(wi, (*jnp.broadcast_shapes(shape, wi.shape[:-1]), 3))
     draws, choice, values = jax.random.split(key, 3)
-    found = mixture.weighted_values(lambda part, subkey: sample(part, wi, subkey, transport)[:2], draws)
+    found = mixture.weighted_values(lambda part, subkey: draw(part, wi, subkey, transport), draws)
     pick = jax.random.uniform(choice, wi.shape[:-1], wi.dtype)
-    passed, (wo, own) = found[0]
-    for share, (drawn, density) in found[1:]:
-        wo = jnp.where((pick < passed)[..., None], wo, drawn)
-        own = jnp.where(pick < passed, own, density)
-        passed = passed + share
+    passed, chosen = found[0]
+    share = jnp.broadcast_to(passed, pick.shape)
+    for weight, drawn in found[1:]:
+        before = pick < passed
+        chosen = jax.tree.map(lambda one, other, before=before: _where(before, one, other), chosen, drawn)
+        share = jnp.where(before, share, weight)
+        passed = passed + weight
     # what a part draws that leaves nowhere must not count as a draw of the others
-    wo = jnp.where((own > 0.0)[..., None], wo, jnp.stack(horizontal(split(wo)), axis=-1))
+    wo = jnp.where((chosen.density > 0.0)[..., None], chosen.wo, jnp.stack(horizontal(split(chosen.wo)), axis=-1))
     density = pdf(mixture, wi, wo, transport)
     value = evaluate(mixture, wi, wo, transport, key=values)
-    return wo, density, safe_div(value * jnp.abs(wo[..., 2:]), density[..., None])
+    weight = safe_div(value * jnp.abs(wo[..., 2:]), density[..., None])
+    along = chosen.specular
+    return Draws(
+        wo,
+        jnp.where(along, (share * chosen.density).astype(density.dtype), density),
+        _where(along, chosen.weight, weight),
+        along,
+    )
+
+
+def _where(mask: Array, one: Array, other: Array) -> Array:
+    """One of two arrays by a mask of their leading axes."""
+    return jnp.where(mask[..., None] if one.ndim > mask.ndim else mask, one, other)
 
 
 def _shape_of(stack: Stack | Mixture | Prepared) -> Shape:

@@ -20,7 +20,7 @@ from layerjax._devices import compile_for_devices, shard_rows
 from layerjax._shapes import Shape, axes_of_map
 from layerjax.directions import join, split
 from layerjax.stack import Stack
-from layerjax.transport.contract import TEXELS, Side, Transport
+from layerjax.transport.contract import TEXELS, Draws, Side, Transport
 from layerjax.transport.known_directions import KnownDirections, separate_cosines
 
 
@@ -165,17 +165,15 @@ def values(
 
 
 @compile_for_devices
-def draws(
-    stack: Stack, transport: Transport, layout: Layout, wi: Array, channels: int, key: Array
-) -> tuple[Array, Array, Array]:
-    """Directions drawn, densities and weights for every texel, as `layerjax.sample` gives them."""
+def draws(stack: Stack, transport: Transport, layout: Layout, wi: Array, channels: int, key: Array) -> Draws:
+    """Directions drawn for every texel, as `layerjax.sample` gives them."""
 
     def one(stack: Stack, wi: Array, key: Array) -> tuple[Array, ...]:
-        wo, density, weight = transport.sample_batch(transport.prepare(stack), wi, channels, key)
-        return (*split(wo), density, *(weight[..., c] for c in range(channels)))
+        drawn = transport.sample_batch(transport.prepare(stack), wi, channels, key)
+        return (*split(drawn.wo), drawn.density, drawn.specular, *(drawn.weight[..., c] for c in range(channels)))
 
     found = [layout.gather(value) for value in _map_directions(one, stack, transport, layout, (wi,), key)]
-    return jnp.stack(found[:3], axis=-1), found[3], jnp.stack(found[4:], axis=-1)
+    return Draws(jnp.stack(found[:3], axis=-1), found[3], jnp.stack(found[5:], axis=-1), found[4])
 
 
 @compile_for_devices

@@ -25,10 +25,11 @@ from jax import Array
 from layerjax import gallery
 from layerjax._parameters import leaves_with_names
 from layerjax._shapes import map_shape
-from layerjax.evaluate import evaluate, pdf, sample, unscattered
+from layerjax.evaluate import draw, evaluate, pdf, specular, unscattered
 from layerjax.mixture import Mixture, stacks_of
 from layerjax.preparation import choose_transport, prepare
 from layerjax.stack import Interface, Stack, require_numbers, simplify
+from layerjax.transport.specular import has_specular
 
 NAME = "layerjax"
 BATCHES = (1 << 8, 1 << 12, 1 << 15)
@@ -86,10 +87,12 @@ class PluginMaterial:
 
     def _set_stack(self, stack: Stack | Mixture) -> None:
         self.stack, self.prepared = stack, prepare(stack, self.transport)
-        layers = [simplify(part).layers for part in stacks_of(stack) if part.base is None]
+        parts = [simplify(part) for part in stacks_of(stack)]
+        layers = [part.layers for part in parts if part.base is None]
         interfaces = [[layer.ior for layer in one if isinstance(layer, Interface)] for one in layers]
         self.is_open = bool(layers)
         self.has_null = not all(interfaces)
+        self.has_delta = any(map(has_specular, parts))
         self.eta = next((float(found[-1]) for found in reversed(interfaces) if found), 1.0)
 
     def update(self) -> None:
@@ -129,6 +132,16 @@ class PluginMaterial:
 
         return mi.Spectrum(*_call_in_batches(shares_of, self._differentiable(), wi))
 
+    def delta(self, wi: Any) -> tuple[Any, Any]:
+        """Energies along the mirror and the refracted direction, spectra."""
+
+        def shares_of(numbers: Any, wi: Any) -> tuple[Array, ...]:
+            mirrored, passed = specular(self.replace_numbers(numbers), _rows(wi))
+            return (*self._split_colours(mirrored), *self._split_colours(passed))
+
+        found = _call_in_batches(shares_of, self._differentiable(), wi)
+        return mi.Spectrum(*found[: self.colours]), mi.Spectrum(*found[self.colours :])
+
     def density(self, wi: Any, wo: Any) -> Any:
         """Density of `draw`, in 1/sr, without derivatives."""
 
@@ -137,15 +150,16 @@ class PluginMaterial:
 
         return _call_in_batches(densities_of, {}, dr.detach(wi), dr.detach(wo))[0]
 
-    def draw(self, wi: Any, uniform: Any) -> tuple[Any, Any]:
-        """Directions and their densities, without derivatives; uniform: numbers that the key is made of."""
+    def draw(self, wi: Any, uniform: Any) -> tuple[Any, Any, Any]:
+        """Directions and their densities, and which are along a delta, without derivatives; uniform: numbers that the
+        key is made of."""
 
         def draws_of(_: Any, wi: Any, uniform: Any) -> tuple[Array, ...]:
-            wo, density, _ = sample(self.prepared, _rows(wi), _key(wi, uniform))
-            return (*wo.T, density)
+            drawn = draw(self.prepared, _rows(wi), _key(wi, uniform))
+            return (*drawn.wo.T, drawn.density, drawn.specular.astype(drawn.density.dtype))
 
-        *wo, density = _call_in_batches(draws_of, {}, dr.detach(wi), dr.detach(uniform))
-        return mi.Vector3f(*wo), density
+        *wo, density, along = _call_in_batches(draws_of, {}, dr.detach(wi), dr.detach(uniform))
+        return mi.Vector3f(*wo), density, along > 0.5
 
     def _differentiable(self) -> dict[str, Any]:
         """The numbers that gradients are enabled for."""
@@ -166,11 +180,8 @@ def _plugin(variant: str) -> type:
             self._name_components()
 
         def _name_components(self) -> None:
-            sides = mi.BSDFFlags.FrontSide | mi.BSDFFlags.BackSide
-            kinds = [mi.BSDFFlags.GlossyReflection | sides]
-            kinds += [mi.BSDFFlags.GlossyTransmission | sides] if self.material.is_open else []
-            kinds += [mi.BSDFFlags.Null | sides] if self.material.has_null else []
-            self.m_components, self.m_flags = kinds, reduce(or_, kinds)
+            self.m_components = _components(self.material)
+            self.m_flags = reduce(or_, self.m_components)
 
         def traverse(self, callback: Any) -> None:
             for name, number in self.material.numbers.items():
@@ -202,6 +213,17 @@ def _plugin(variant: str) -> type:
     return Layered
 
 
+def _components(material: PluginMaterial) -> list[int]:
+    """Flags of the components: reflection, transmission, what passes unscattered, and the deltas of smooth surfaces."""
+    flags = mi.BSDFFlags
+    kinds = [flags.GlossyReflection]
+    kinds += [flags.GlossyTransmission] if material.is_open else []
+    kinds += [flags.Null] if material.has_null else []
+    if material.has_delta:
+        kinds += [flags.DeltaReflection, flags.DeltaTransmission] if material.is_open else [flags.DeltaReflection]
+    return [kind | flags.FrontSide | flags.BackSide for kind in kinds]
+
+
 def _scene_material(properties: Any) -> PluginMaterial:
     """The material that a scene names."""
     name = properties.get("material", "")
@@ -229,7 +251,7 @@ def _evaluate_with_pdf(material: PluginMaterial, ctx: Any, si: Any, wo: Any, act
 def _sample(material: PluginMaterial, ctx: Any, si: Any, sample1: Any, sample2: Any, active: Any) -> tuple[Any, Any]:
     """Directions are drawn without derivatives, and the value over their density has those of the value."""
     null = _null_probability(material, ctx, si)
-    wo, density = material.draw(si.wi, mi.Vector3f(sample1, *sample2))
+    wo, density, along = material.draw(si.wi, mi.Vector3f(sample1, *sample2))
     density *= 1.0 - null
     value = dr.select(density > 0.0, _evaluate(material, ctx, si, wo, active) / density, 0.0)
     drawn = mi.BSDFSample3f(wo)
@@ -239,6 +261,22 @@ def _sample(material: PluginMaterial, ctx: Any, si: Any, sample1: Any, sample2: 
     drawn.eta = dr.select(passes, down, 1.0)
     glossy = dr.select(passes, +mi.BSDFFlags.GlossyTransmission, +mi.BSDFFlags.GlossyReflection)
     drawn.sampled_type, drawn.sampled_component = mi.UInt32(glossy), dr.select(passes, mi.UInt32(1), mi.UInt32(0))
+    if material.has_delta:
+        place = 1 + material.is_open + material.has_null
+        enabled = [
+            mi.Bool(ctx.is_enabled(kind, place + side))
+            for side, kind in enumerate((mi.BSDFFlags.DeltaReflection, mi.BSDFFlags.DeltaTransmission))
+        ]
+        mirrored, passed = material.delta(si.wi)
+        # radiance that crosses to another index changes with its square
+        scale = dr.rcp(drawn.eta * drawn.eta) if ctx.mode == mi.TransportMode.Radiance else 1.0
+        energy = dr.select(passes, passed * scale, mirrored)
+        energy = dr.select(dr.select(passes, enabled[1], enabled[0]), energy, 0.0)
+        value = dr.select(along, energy / dr.maximum(density, 1e-12), value)
+        kind = dr.select(passes, +mi.BSDFFlags.DeltaTransmission, +mi.BSDFFlags.DeltaReflection)
+        drawn.sampled_type = dr.select(along, mi.UInt32(kind), drawn.sampled_type)
+        component = dr.select(passes, mi.UInt32(place + 1), mi.UInt32(place))
+        drawn.sampled_component = dr.select(along, component, drawn.sampled_component)
     if material.has_null:
         passes_through = sample1 < null
         drawn.wo = dr.select(passes_through, -si.wi, drawn.wo)

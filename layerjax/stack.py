@@ -29,7 +29,7 @@ LEAST_EXTINCTION = 1e-10
 
 
 class Interface(ReprModule):
-    """Rough dielectric interface of microfacets (Walter et al. 2007).
+    """Dielectric interface: rough, of microfacets (Walter et al. 2007), or smooth.
 
     With Fresnel term F, distribution of normals D and masking G = G1(wi) G1(wo), reflection and transmission are::
 
@@ -41,13 +41,16 @@ class Interface(ReprModule):
     ============ ====== ===== ==== ============ ======== ============== ================================================
     ior          eta    ()    1    [0.25, 4]    required yes            refractive index of the medium below, relative
                                                                         to the surroundings of the stack
-    alpha        alpha  ()    1    [1e-4, 1]    required yes            width of D; [1e-4, 15] for ``"vmf"``, where
-                                                                        kappa = 2 / alpha^2
+    alpha        alpha  ()    1    [1e-4, 1]    None     yes            width of D; [1e-4, 15] for ``"vmf"``, where
+                                                                        kappa = 2 / alpha^2; None and 0: smooth
     distribution D                 "ggx",       "ggx"    no             GGX, Beckmann (Gaussian slopes) or von
                                    "beckmann",                          Mises-Fisher; the last two only in `ENDF`, and
                                    "vmf"                                in `AddingDoubling` and `RandomWalk` with
                                                                         ``facet_multiple_scattering=False``
     ============ ====== ===== ==== ============ ======== ============== ================================================
+
+    A smooth interface reflects and refracts each ray by itself: see `layerjax.specular`. It is in `AddingDoubling`,
+    `RandomWalk` and `Statistical`; a width that is traced or fitted stays rough.
 
     Light that is blocked by masking is lost, also where the index hardly changes: with ior 1.001 and alpha 0.3, light
     at 75 degrees loses 20 % at a crossing, and a base that is lit and viewed at 75 degrees is 36 % darker. Transports
@@ -56,11 +59,16 @@ class Interface(ReprModule):
     """
 
     ior: Parameter = parameter("Interface.ior")
-    alpha: Parameter = parameter("Interface.alpha", ranged=False)
+    alpha: Parameter = parameter("Interface.alpha", default=None, optional=True, ranged=False, absent_at_zero=True)
     distribution: Distribution = eqx.field(static=True, default="ggx")
 
     def __check_init__(self) -> None:
         check_facets("Interface", self.distribution, self.alpha)
+
+    @property
+    def is_smooth(self) -> bool:
+        """Whether it is without facets, by structure."""
+        return self.alpha is None
 
 
 class Medium(ReprModule):

@@ -1,4 +1,4 @@
-"""Stacks as Mitsuba scenes: `volpath` carries light through them, `roughdielectric` and `roughconductor` stand alone.
+"""Stacks as Mitsuba scenes: `volpath` carries light through them, single surfaces stand alone.
 
 A medium is a slab 1 unit deep between two rectangles, much wider than light can spread, with a null BSDF where no
 interface lies; one directional emitter is the light. What differs from layerjax, and how it is translated:
@@ -22,6 +22,9 @@ from benchmarks.peers.mitsuba_flakes import flakes
 WIDTH = 1e4
 """Half width of the rectangles, in depths of a medium."""
 
+FAR = 1e3
+"""Distance of a light with an extent."""
+
 LANES = 1 << 20
 """Paths that are traced together."""
 
@@ -35,6 +38,8 @@ class Volpath:
         stack: what it holds must have a counterpart in Mitsuba.
         wi: unit direction towards the light, (3,).
         order: events that a path may have, at most; None: any number.
+        cone: half angle of the light, in radians: values are then means over its directions, weighted by their
+            cosines. No path finds light from a single direction through a smooth surface.
         roulette: events after which Russian roulette ends paths; Mitsuba's default is 5, and from then on at least one
             path in twenty ends at every event.
 
@@ -43,7 +48,9 @@ class Volpath:
             indices, or the base is another surface.
     """
 
-    def __init__(self, stack: lj.Stack, wi: Values, order: int | None = None, roulette: int = 5) -> None:
+    def __init__(
+        self, stack: lj.Stack, wi: Values, order: int | None = None, cone: float | None = None, roulette: int = 5
+    ) -> None:
         import mitsuba as mi
 
         mi.set_variant(VARIANT)
@@ -51,6 +58,8 @@ class Volpath:
         self.cosine, self.side = abs(float(wi[2])), float(np.sign(wi[2]))
         shapes, self.bottom = _shapes(mi, stack)
         sun = {"type": "directional", "direction": [-float(c) for c in wi], "irradiance": _rgb(1.0)}
+        if cone is not None:  # of irradiance 1 across wi
+            sun = _disc(mi, wi, cone)
         self.scene = mi.load_dict({"type": "scene", "sun": sun, **shapes}, optimize=False)
         depth = -1 if order is None else order + 1
         self.integrator = mi.load_dict({"type": "volpath", "max_depth": depth, "rr_depth": roulette})
@@ -107,6 +116,16 @@ class Volpath:
         sampler.seed(seed, paths)
         radiance, _, _ = self.integrator.sample(self.scene, sampler, mi.Ray3f(origin, -wo))
         return radiance
+
+
+def _disc(mi: Any, wi: Values, cone: float) -> dict[str, Any]:
+    """A distant disc, which the stack sees as this cone; its mean cosine is that of its middle."""
+    place = mi.ScalarTransform4f().look_at(
+        origin=[FAR * float(c) for c in wi], target=[0.0, 0.0, 0.0], up=[0.3, 0.9, 0.1]
+    )
+    place = place.scale([FAR * np.tan(cone), FAR * np.tan(cone), 1.0])
+    emitter = {"type": "area", "radiance": _rgb(1.0 / (np.pi * np.sin(cone) ** 2))}
+    return {"type": "disk", "to_world": place, "emitter": emitter}
 
 
 def surface_values(stack: lj.Stack, wi: Values, wo: Values) -> Values:
@@ -188,6 +207,8 @@ def _interface(interface: Any, above: float) -> dict[str, Any]:
     below = float(interface.ior)
     if below == above:
         raise ValueError("Mitsuba's roughdielectric needs two different indices")
+    if interface.is_smooth:
+        return {"type": "dielectric", "int_ior": below, "ext_ior": above}
     return {
         "type": "roughdielectric",
         "distribution": _normals(interface),
@@ -202,6 +223,8 @@ def _base(base: Any, above: float) -> dict[str, Any]:
         return {"type": "diffuse", "reflectance": _rgb(base.albedo)}
     if isinstance(base, lj.Conductor):
         index = {"eta": _rgb(base.ior / above), "k": _rgb(base.k / above)}
+        if base.is_smooth:
+            return {"type": "conductor", **index}
         return {"type": "roughconductor", "distribution": _normals(base), "alpha": float(base.alpha), **index}
     raise ValueError(f"base: Mitsuba has no {type(base).__name__}")
 

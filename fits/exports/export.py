@@ -56,6 +56,9 @@ class ExportReport:
     notes: tuple[str, ...]
 
 
+MIRRORED = "what smooth surfaces mirror and transmit along single directions is omitted (lj.specular gives it)"
+
+
 @program_cache()
 def export(
     material: "lj.Stack | lj.Mixture | Fit",
@@ -99,7 +102,8 @@ def export(
     prepared = material_of(stack, chosen, name or path.stem, given_progress(progress))
     written = _WRITERS[to](prepared, _checked(wavelengths, to, prepared.channels))
     write_bytes(path, written.content, force)
-    return ExportReport(path, to, written.notes)
+    omitted = prepared.is_mirror and to != "klems"
+    return ExportReport(path, to, (*written.notes, *([MIRRORED] if omitted else [])))
 
 
 def _stack_and_transport(material: Any, transport: Any) -> tuple[lj.Stack | lj.Mixture, Any]:

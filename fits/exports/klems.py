@@ -104,10 +104,9 @@ def _matrix(material: Material, stage: str, sign: float, through: bool) -> tuple
     sums = np.einsum("oic,o->ic", matrix, outgoing.projected)
     factor = np.where(sums > 0, albedo / np.where(sums > 0, sums, 1.0), 1.0)
     matrix *= factor
-    if through:
-        fine = patches(POINTS_COLLIMATED).directions * np.array([1.0, -1.0, sign])
-        collimated = material.unscattered(fine.reshape(-1, 3)).reshape(count, fine.shape[1], -1).mean(axis=1)
-        matrix[np.arange(count), np.arange(count)] += collimated / incident.projected[:, None]
+    fine = patches(POINTS_COLLIMATED).directions * np.array([1.0, -1.0, sign])
+    collimated = material.specular(fine.reshape(-1, 3))[1 if through else 0].reshape(count, fine.shape[1], -1)
+    matrix[np.arange(count), np.arange(count)] += collimated.mean(axis=1) / incident.projected[:, None]
     return matrix, float(np.max(np.maximum(factor, 1.0 / np.maximum(factor, 1e-9)), initial=1.0, where=sums > 1e-6))
 
 

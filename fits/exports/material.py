@@ -49,10 +49,17 @@ class Material:
         shape = (len(wi), self.channels)
         return np.broadcast_to(reflected, shape).astype(float), np.broadcast_to(transmitted, shape).astype(float)
 
-    def unscattered(self, wi: Floats) -> Floats:
-        """Collimated (unscattered) transmittance of light from directions (N, 3), (N, C)."""
-        transmitted = np.asarray(lj.unscattered(self.stack, wi))
-        return np.broadcast_to(transmitted, (len(wi), self.channels)).astype(float)
+    def specular(self, wi: Floats) -> tuple[Floats, Floats]:
+        """Specular reflectance and collimated transmittance of light from directions (N, 3), (N, C) each."""
+        reflected, transmitted = lj.specular(self.stack, wi)
+        shape = (len(wi), self.channels)
+        return np.broadcast_to(reflected, shape).astype(float), np.broadcast_to(transmitted, shape).astype(float)
+
+    @property
+    def is_mirror(self) -> bool:
+        """Whether smooth surfaces send part of the light along a single direction."""
+        surfaces = (layer for part in self.parts for layer in (*part.layers, part.base))
+        return any(layer.is_smooth for layer in surfaces if isinstance(layer, lj.Interface | lj.Conductor))
 
     def require_air_below(self) -> None:
         """ValueError for a stack that ends in another index than that of air."""
@@ -116,10 +123,10 @@ def _batches(w: Floats) -> Iterator[Floats]:
 def _widths(stack: lj.Stack) -> Iterator[float]:
     for layer in stack.layers:
         if isinstance(layer, lj.Interface):
-            yield _number(layer.alpha)
+            yield from () if layer.is_smooth else (_number(layer.alpha),)
         elif layer.phase.flakes is not None and layer.phase.flakes.kind == "surface" and layer.phase.is_axisymmetric:
             yield _number(layer.phase.flakes.alpha)
-    if isinstance(stack.base, lj.Conductor):
+    if isinstance(stack.base, lj.Conductor) and not stack.base.is_smooth:
         yield _number(stack.base.alpha)
 
 

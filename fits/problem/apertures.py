@@ -75,6 +75,8 @@ def _narrowest(material: lj.Stack | lj.Mixture) -> tuple[float, float]:
     for stack in stacks_of(material):
         for part in (*stack.layers, stack.base):
             if isinstance(part, lj.Interface | lj.Conductor):
+                if part.is_smooth:  # what it mirrors is not in the values
+                    continue
                 facets.append(float(np.min(at_start(part.alpha, 1))))
             elif isinstance(part, lj.Medium | lj.TurbidMedium):
                 for end in (1, 2):  # at the lower bounds of what is free, and at the upper

@@ -64,16 +64,17 @@ class Totalling(eqx.Module):
 def _both(stack: lj.Stack | lj.Mixture, lights: Array, transport: Any) -> tuple[Array, Array]:
     """All that leaves on the side of each light, and on the other."""
     near, far = lj.albedo(stack, lights, transport)
-    return near, far + lj.unscattered(stack, lights)
+    mirrored, passed = lj.specular(stack, lights)
+    return near + mirrored, far + passed
 
 
 def _unscattered(stack: lj.Stack | lj.Mixture, lights: Array, transport: Any) -> Array:
     """What leaves on the other side of stacks whose media only absorb: interfaces may turn it, media do not."""
     if isinstance(stack, lj.Mixture):
         return stack.mean(lambda part, _: _unscattered(part, lights, transport))
-    unscattered = lj.unscattered(stack, lights)
-    if stack.base is not None or not any(isinstance(layer, lj.Interface) for layer in stack.layers):
-        return unscattered
+    _, passed = lj.specular(stack, lights)
+    if stack.base is not None or all(layer.is_smooth for layer in stack.layers if isinstance(layer, lj.Interface)):
+        return passed
     layers = simplify(stack).layers
     absorbing = [lj.Medium(one.thickness, 0.0) if isinstance(one, lj.Medium) else one for one in layers]
-    return unscattered + lj.albedo(lj.Stack(absorbing), lights, transport)[1]
+    return passed + lj.albedo(lj.Stack(absorbing), lights, transport)[1]

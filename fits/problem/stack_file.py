@@ -218,13 +218,31 @@ def _build(where: str, table: Any, kinds: _Kinds) -> Any:
     if "kind" not in require_table(where, table):
         raise ValueError(f"{where} has no kind, must be one of {', '.join(kinds)}")
     kind = kinds[choice(f"{where}.kind", table["kind"], kinds)]
-    return _make(where, kind, {key: value for key, value in table.items() if key != "kind"})
+    numbers = {key: value for key, value in table.items() if key != "kind"}
+    if kind not in (lj.Interface, lj.Conductor):
+        return _make(where, kind, numbers)
+    return _make(where, kind, _read_roughness(where, numbers), also=("smooth",))
 
 
-def _make(where: str, kind: type, table: Any) -> Any:
-    """The object of this class that a table of its parameters describes; the class itself says what may stand there."""
+def _read_roughness(where: str, table: dict[str, Any]) -> dict[str, Any]:
+    """A file says of every interface and metal how rough it is, or that it is smooth: none is by mistake."""
+    smooth = table.pop("smooth", False)
+    if not isinstance(smooth, bool):
+        raise ValueError(f"{where}.smooth: {smooth!r:.60} is neither true nor false")
+    if smooth and "alpha" in table:
+        raise ValueError(f"{where}.smooth: true, and alpha given as well: must be one of them")
+    if not smooth and "alpha" not in table:
+        raise ValueError(f"{where} has no alpha, must have it or smooth = true")
+    return table
+
+
+def _make(where: str, kind: type, table: Any, also: tuple[str, ...] = ()) -> Any:
+    """The object of this class that a table of its parameters describes; the class itself says what may stand there.
+
+    also: further keys that a file may have there.
+    """
     known = {_key(name): parameter for name, parameter in inspect.signature(kind).parameters.items()}
-    check_keys(where, require_table(where, table), tuple(known))
+    check_keys(where, require_table(where, table), (*known, *also))
     for key, parameter in known.items():
         if parameter.default is inspect.Parameter.empty and key not in table:
             raise ValueError(f"{where} has no {key}, which {kind.__name__} needs")
@@ -326,6 +344,8 @@ def _module_to_dict(module: Any) -> dict[str, Any]:
     """The table of a layer, base, phase function, transport or prior; what is None is omitted."""
     names = inspect.signature(type(module)).parameters
     entries = {_key(name): _to_plain(getattr(module, name)) for name in names if getattr(module, name) is not None}
+    if isinstance(module, lj.Interface | lj.Conductor) and module.is_smooth:
+        entries["smooth"] = True
     return {"kind": type(module).__name__, **entries}
 
 

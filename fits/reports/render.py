@@ -109,7 +109,7 @@ def _sky(stack: lj.Stack | lj.Mixture, prepared: Prepared, wo: Floats) -> Floats
     cosine = np.sin(0.5 * np.pi * (np.arange(SKY_COSINES) + 0.5) / SKY_COSINES)
     azimuth = np.linspace(-np.pi, np.pi, SKY_AZIMUTHS + 1)
     towards = lj.direction(np.arccos(cosine)[:, None], azimuth)
-    energy = sum(np.asarray(part) for part in lj.albedo(prepared, towards)) + np.asarray(lj.unscattered(stack, towards))
+    energy = sum(np.asarray(part) for part in (*lj.albedo(prepared, towards), *lj.specular(stack, towards)))
     table = RegularGridInterpolator((cosine, azimuth), energy, bounds_error=False, fill_value=None)
     near = np.clip(wo[:, 2], cosine[0], cosine[-1])
     return np.asarray(table(np.stack([near, np.arctan2(wo[:, 1], wo[:, 0])], axis=-1)))

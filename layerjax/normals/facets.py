@@ -36,9 +36,9 @@ TAIL = 4.6
 
 
 def check_facets(owner: str, distribution: Any, alpha: Any) -> None:
-    """Refuse a distribution that is none, and a width outside the range that belongs to it."""
+    """Refuse a distribution that is none, and a width outside the range that belongs to it; None: smooth."""
     require_choice(f"{owner}.distribution", distribution, get_args(Distribution))
-    if not is_placeholder(alpha):
+    if alpha is not None and not is_placeholder(alpha):
         check_range(f"{owner}.alpha" if distribution == "ggx" else f"{owner}.alpha, {distribution}", alpha)
 
 

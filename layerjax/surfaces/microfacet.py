@@ -1,15 +1,16 @@
-"""Rough conductors of microfacets: single scattering, separable Smith masking (Walter et al. 2007)."""
+"""Conductors: mirrors, and rough ones of microfacets with separable Smith masking (Walter et al. 2007)."""
 
 from typing import Any
 
 import equinox as eqx
+import jax.numpy as jnp
 from jax import Array
 
 from layerjax import fresnel
 from layerjax._checks import require_kind
 from layerjax._parameters import Parameter, parameter
 from layerjax.channels import Channels, map_channels, per_channel
-from layerjax.directions import Vector, half_vector, reflect
+from layerjax.directions import Vector, half_vector, mirror, reflect
 from layerjax.normals import facets
 from layerjax.normals.facets import Distribution, check_facets, reflection_pdf
 from layerjax.quadrature import Nodes
@@ -20,6 +21,9 @@ from layerjax.surfaces.thin_film import ThinFilm
 class Conductor(Surface):
     """Rough conductor: f = F D G / (4 cos_i cos_o), with the Fresnel term F of the index n + i k (Walter et al. 2007).
 
+    A smooth one is a mirror, whose f is 0 but for a delta: see `layerjax.specular`; in the transports of smooth
+    interfaces.
+
     ============ ====== ======== ==== ============ ======== ============== =============================================
     parameter    symbol shape    unit range        default  differentiable meaning
     ============ ====== ======== ==== ============ ======== ============== =============================================
@@ -27,8 +31,8 @@ class Conductor(Surface):
                                                                            surroundings of the stack
     k            k      (), (C,) 1    [0, 20]      required yes            imaginary part of the index (extinction
                                                                            coefficient), with the same reference
-    alpha        alpha  ()       1    [1e-4, 1]    required yes            width of D; [1e-4, 15] for ``"vmf"``, where
-                                                                           kappa = 2 / alpha^2
+    alpha        alpha  ()       1    [1e-4, 1]    None     yes            width of D; [1e-4, 15] for ``"vmf"``, where
+                                                                           kappa = 2 / alpha^2; None and 0: a mirror
     distribution D                    "ggx",       "ggx"    no             as of an `Interface`
                                       "beckmann",
                                       "vmf"
@@ -39,13 +43,18 @@ class Conductor(Surface):
 
     ior: Parameter = parameter("Conductor.ior")
     k: Parameter = parameter("Conductor.k")
-    alpha: Parameter = parameter("Conductor.alpha", ranged=False)
+    alpha: Parameter = parameter("Conductor.alpha", default=None, optional=True, ranged=False, absent_at_zero=True)
     distribution: Distribution = eqx.field(static=True, default="ggx")
     film: ThinFilm | None = None
 
     def __check_init__(self) -> None:
         check_facets("Conductor", self.distribution, self.alpha)
         require_kind("Conductor.film", self.film, ThinFilm, None)
+
+    @property
+    def is_smooth(self) -> bool:
+        """Whether it is a mirror, by structure: then all that it reflects is a delta."""
+        return self.alpha is None
 
     def reflectance(self, cosine: Array) -> Channels:
         """Fresnel reflectance of a facet, by the cosine of incidence on it."""
@@ -64,18 +73,26 @@ class Conductor(Surface):
         return eqx.tree_at(lambda base: (base.film.ior, base.film.thickness_nm), relative, film)
 
     def evaluate(self, wi: Vector, wo: Vector) -> tuple[Array, ...]:
+        if self.is_smooth:
+            return (jnp.zeros_like(wi[2] * wo[2]),)
         h, cosine = half_vector(wi, wo, same_side=True)
         lobe = mirror_lobe(h, wi, wo, self.alpha, self.distribution)
         return tuple(lobe * level for level in self.reflectance(cosine))
 
     def sample(self, wi: Vector, u1: Array, u2: Array) -> Vector:
+        if self.is_smooth:
+            return mirror(wi)
         return reflect(wi, facets.sample(wi, self.alpha, u1, u2, self.distribution))
 
     def pdf(self, wi: Vector, wo: Vector) -> Array:
+        if self.is_smooth:
+            return jnp.zeros_like(wi[2] * wo[2])
         h, _ = half_vector(wi, wo, same_side=True)
         return reflection_pdf(h, wi, self.alpha, self.distribution)
 
     def rule(self, wi: Vector, nodes: int) -> Nodes:
+        if self.is_smooth:
+            return super().rule(wi, nodes)
         return facets.rule(wi, self.alpha, nodes, self.distribution)
 
 

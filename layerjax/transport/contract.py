@@ -7,7 +7,7 @@ turn batches of directions into what its own functions take: `DeterministicTrans
 
 import abc
 from collections.abc import Sequence
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import equinox as eqx
 import jax
@@ -27,6 +27,17 @@ Side = Literal["all", "reflection", "transmission"]
 """Requested pairs: any; both directions above; one above and one below. Others give 0."""
 
 Uniforms = tuple[Array, Array, Array]
+
+
+class Draws(NamedTuple):
+    """Outgoing directions ``(..., 3)``, their densities ``(...)`` (of a delta the probability), weights ``(..., C)``,
+    and whether each is along a delta ``(...)``."""
+
+    wo: Array
+    density: Array
+    weight: Array
+    specular: Array
+
 
 TEXELS = 2000
 """Of a map of stacks, worked on together where a stack costs a few numbers: what they need stays in the cache.
@@ -117,9 +128,14 @@ class Transport(eqx.Module):
         """Further error of values ``(..., C)`` that all resolutions share, for example where they are clamped to 0."""
         return 0.0
 
+    def specular_draws(self, state: Any, wi: Vector, uniforms: Uniforms) -> tuple[Array, Array, Channels] | None:
+        """Which draws of `sample` are along a delta, the probability of such a draw, and the energy of the delta; None
+        if there are no deltas."""
+        return None
+
     @abc.abstractmethod
-    def sample_batch(self, state: Any, wi: Array, channels: int, key: Array) -> tuple[Array, Array, Array]:
-        """Outgoing directions ``(..., 3)``, their densities ``(...)`` and weights ``(..., C)``."""
+    def sample_batch(self, state: Any, wi: Array, channels: int, key: Array) -> Draws:
+        """Draws for each wi."""
 
     @abc.abstractmethod
     def albedo_batch(self, state: Any, wi: Array, channels: int, nodes: int, key: Array | None) -> tuple[Array, Array]:
@@ -177,15 +193,24 @@ class DeterministicTransport(Transport):
 
         return map_direction_chunks(values, wi, wo), None
 
-    def sample_batch(self, state: Any, wi: Array, channels: int, key: Array) -> tuple[Array, Array, Array]:
+    def sample_batch(self, state: Any, wi: Array, channels: int, key: Array) -> Draws:
         def draw(wi: Vector, uniforms: Vector) -> tuple[Array, ...]:
             wo, density = self._sample_with_density(state, wi, uniforms)
             values = self.evaluate(state, wi, wo, "all")
             weights = [safe_div(pick(values, c) * jnp.abs(wo[2]), density) for c in range(channels)]
-            return (*wo, density, *weights)
+            deltas = self.specular_draws(state, wi, uniforms)
+            if deltas is None:
+                return (*wo, density, *weights)
+            along, probability, energies = deltas
+            density = jnp.where(along, probability, density)
+            weights = [
+                jnp.where(along, safe_div(pick(energies, c), probability), weight) for c, weight in enumerate(weights)
+            ]
+            return (*wo, density, *weights, along.astype(density.dtype))
 
         found = map_direction_chunks(draw, wi, jax.random.uniform(key, wi.shape, dtype=wi.dtype))
-        return found[..., :3], found[..., 3], found[..., 4:]
+        along = jnp.zeros(found.shape[:-1], bool) if found.shape[-1] == 4 + channels else found[..., -1] > 0
+        return Draws(found[..., :3], found[..., 3], found[..., 4 : 4 + channels], along)
 
     def albedo_batch(self, state: Any, wi: Array, channels: int, nodes: int, key: Array | None) -> tuple[Array, Array]:
         def one(wi: Array) -> tuple[Array, Array]:
@@ -236,15 +261,24 @@ class RandomTransport(Transport):
         values, errors = self.estimate(state, i, o, side, channels, key)
         return values.reshape(*batch, -1), errors.reshape(*batch, -1)
 
-    def sample_batch(self, state: Any, wi: Array, channels: int, key: Array) -> tuple[Array, Array, Array]:
+    def sample_batch(self, state: Any, wi: Array, channels: int, key: Array) -> Draws:
         def draw(wi: Vector, uniforms: Vector) -> tuple[Array, ...]:
             wo, density = self._sample_with_density(state, wi, uniforms)
-            return (*wo, density)
+            deltas = self.specular_draws(state, wi, uniforms)
+            if deltas is None:
+                return (*wo, density)
+            along, probability, energies = deltas
+            parts = [safe_div(pick(energies, c), probability) for c in range(channels)]
+            return (*wo, jnp.where(along, probability, density), along.astype(density.dtype), *parts)
 
         found = map_direction_chunks(draw, wi, jax.random.uniform(key, wi.shape, dtype=wi.dtype))
         wo, density = found[..., :3], found[..., 3]
         values, _ = self.evaluate_batch(state, wi, wo, "all", channels, jax.random.fold_in(key, 1))
-        return wo, density, safe_div(values * jnp.abs(wo[..., 2:]), density[..., None])
+        weight = safe_div(values * jnp.abs(wo[..., 2:]), density[..., None])
+        if found.shape[-1] == 4:
+            return Draws(wo, density, weight, jnp.zeros(density.shape, bool))
+        along = found[..., 4] > 0
+        return Draws(wo, density, jnp.where(along[..., None], found[..., 5:], weight), along)
 
     def albedo_batch(self, state: Any, wi: Array, channels: int, nodes: int, key: Array | None) -> tuple[Array, Array]:
         batch = wi.shape[:-1]
@@ -263,6 +297,16 @@ def refuse_film(base: Surface | None, transport: str) -> None:
             f"base.film: {transport} carries no ThinFilm; AddingDoubling, RandomWalk, SingleScattering, SpongeCake and "
             "WeidlichWilkie do"
         )
+
+
+def refuse_smooth(stack: Stack, names: Sequence[str], transport: str) -> None:
+    """Raise a ValueError that names the first smooth interface or mirror, on behalf of a transport without them."""
+    for name, part in [*zip(names, stack.layers, strict=True), ("base", stack.base)]:
+        if isinstance(part, Interface | Conductor) and part.is_smooth:
+            raise ValueError(
+                f"{name}.alpha: {transport} carries no smooth {type(part).__name__} (give alpha, in [0.0001, 1]); "
+                "AddingDoubling, RandomWalk and Statistical do"
+            )
 
 
 def require_ggx(stack: Stack, names: Sequence[str], transport: str) -> None:

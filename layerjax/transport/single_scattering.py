@@ -25,7 +25,7 @@ from layerjax.directions import Vector, half_vector, is_above, sanitise, select
 from layerjax.quadrature import Nodes
 from layerjax.stack import Interface, Medium, Stack, is_known, media_of, optical_depths
 from layerjax.surfaces import Surface
-from layerjax.transport.contract import TEXELS, DeterministicTransport, Side
+from layerjax.transport.contract import TEXELS, DeterministicTransport, Side, refuse_smooth
 
 BASE = -1
 """Stands for the base among the indices of layers."""
@@ -51,6 +51,7 @@ class SingleScattering(DeterministicTransport):
     texel_batch: ClassVar[int] = TEXELS
 
     def check(self, stack: Stack, names: Sequence[str]) -> None:
+        refuse_smooth(stack, names, "SingleScattering")
         for name, layer in zip(names, stack.layers, strict=True):
             if isinstance(layer, Interface):
                 raise ValueError(

@@ -30,6 +30,16 @@ STACKS: dict[str, tuple[lj.Stack | lj.Mixture, Any]] = {
     "sheet": (SHEET, lj.SingleScattering()),
     "glass": (GLASS, SOLVER),
     "pane": (lj.Stack([lj.Interface(1.5, 0.2), lj.Medium(0.3, 0.8), lj.Interface(1.0, 0.3)]), SOLVER),
+    "varnish": (lj.Stack([lj.Interface(1.5)], lj.Lambertian([0.6, 0.3, 0.1])), SOLVER),
+    "window": (lj.Stack([lj.Interface(1.5), lj.Medium(0.3, 0.8), lj.Interface(1.3)]), SOLVER),
+    "mirror": (lj.Stack([lj.Medium(0.3, 0.8)], lj.Conductor([0.2, 0.9, 1.1], [3.9, 2.4, 2.2])), SOLVER),
+    "spots": (
+        lj.Mixture(
+            {"paint": lj.Stack([], lj.Lambertian(0.4)), "gloss": lj.Stack([lj.Interface(1.5)], lj.Lambertian(0.4))},
+            [0.3, None],
+        ),
+        SOLVER,
+    ),
     "mixture": (lj.Mixture({"paint": lj.Stack([], lj.Lambertian(0.4)), "veil": SHEET}, [0.3, None]), "auto"),
 }
 LIGHTS = ((0.3, 0.2, 0.93), (0.8, 0.0, 0.6), (0.5, 0.1, -0.8))
@@ -92,10 +102,11 @@ def test_draws_are_worth_the_albedo(mi: Any, name: str) -> None:
         )
         weight = np.array(weight).T
         expected = sum(np.asarray(part) for part in lj.albedo(stack, wi, transport)) + np.asarray(
-            lj.unscattered(stack, wi)
+            sum(lj.specular(stack, wi))
         )
         assert np.all(abs(weight.mean(axis=0) - expected) < 4.0 * weight.std(axis=0) / np.sqrt(count) + 2e-3)
-        scattered = np.array(drawn.sampled_type) != int(mi.BSDFFlags.Null)
+        deltas = int(mi.BSDFFlags.Null | mi.BSDFFlags.DeltaReflection | mi.BSDFFlags.DeltaTransmission)
+        scattered = np.array(drawn.sampled_type) & deltas == 0
         density = np.array(made.pdf(mi.BSDFContext(mi.TransportMode.Importance), at(mi, many), drawn.wo))
         kept = scattered & (np.array(drawn.pdf) > 0.0) & np.any(weight > 0.0, axis=1)
         np.testing.assert_allclose(density[kept], np.array(drawn.pdf)[kept], rtol=1e-4)

@@ -74,9 +74,6 @@ UNUSED = {
 MUST_BE = {"c": 1.0, "C": 1.0, "E": 0.0}
 """Columns whose other values the model does not support."""
 
-SMOOTH = 1e-4
-"""Roughness of a polished face."""
-
 SAME_VALUE = 0.01
 """Relative variation from row to row below which numbers of the slab and of the standard count as one."""
 
@@ -114,7 +111,7 @@ class Slab:
         indices = [1.0, self.ior_slides, self.ior]
         above = [after for before, after in pairwise(indices) if after != before]
         below = [after for before, after in pairwise(indices[::-1]) if after != before]
-        return lj.Stack([*(lj.Interface(n, SMOOTH) for n in above), medium, *(lj.Interface(n, SMOOTH) for n in below)])
+        return lj.Stack([*map(lj.Interface, above), medium, *map(lj.Interface, below)])
 
 
 def read_slab(

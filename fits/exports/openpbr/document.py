@@ -79,10 +79,15 @@ def _require_counterpart(material: Material) -> None:
         raise ValueError(
             "an axis in this stack is not the normal, and no lobe of OpenPBR stands for fibers or flakes about it"
         )
+    if material.is_mirror:
+        raise ValueError(
+            "a smooth surface of this stack mirrors along single directions, where no value is fitted: give it an "
+            "alpha, such as 0.01"
+        )
     if material.opaque:
         return
     wi = direction(np.array(INCIDENCE), 0.0)
-    through = float((material.albedos(wi)[1] + material.unscattered(wi)).max())
+    through = float((material.albedos(wi)[1] + material.specular(wi)[1]).max())
     if through > LEAST_THROUGH:
         raise ValueError(
             f"{100 * through:.2g} % of the light is transmitted, and OpenPBR has no lobe that scatters it: "

@@ -104,7 +104,7 @@ def _mirrors(stack: lj.Stack) -> Iterator[tuple[float, float]]:
     """Index and roughness of all that mirrors light about the normal: interfaces, and flakes that lie flat."""
     for layer in stack.layers:
         if isinstance(layer, lj.Interface):
-            yield _number(layer.ior), _number(layer.alpha) ** 0.5
+            yield _number(layer.ior), 0.0 if layer.is_smooth else _number(layer.alpha) ** 0.5
         elif (flakes := _flat(layer)) is not None:
             root = _number(0.04 if layer.f0 is None else layer.f0) ** 0.5
             yield (1.0 + root) / max(1.0 - root, 0.5), _number(flakes.alpha) ** 0.5

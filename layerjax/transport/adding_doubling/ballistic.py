@@ -32,6 +32,7 @@ from layerjax.transport.adding_doubling.operators import (
 )
 from layerjax.transport.adding_doubling.requested_directions import requested_region, turn
 from layerjax.transport.adding_doubling.resolution import is_tilted
+from layerjax.transport.specular import is_smooth
 
 POINTS = (16, 12)
 """Points a panel, and in azimuth, of the facets of either side."""
@@ -77,6 +78,8 @@ def ballistic_paths(stack: Stack) -> Ballistic | None:
 
 def _faces(stack: Stack) -> tuple[int, int] | None:
     if any(map(is_tilted, stack.layers)):  # what they pass goes with the azimuth
+        return None
+    if any(map(is_smooth, stack.layers)):  # it is bent on its way
         return None
     faces = [place for place, layer in enumerate(stack.layers) if isinstance(layer, Interface)]
     return (faces[0], faces[1]) if stack.base is None and len(faces) == 2 else None

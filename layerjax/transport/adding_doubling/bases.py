@@ -22,6 +22,8 @@ from layerjax.transport.adding_doubling.sampling import modes_at_nodes, projecte
 
 def base_layer(region: Region, base: Surface, modes: int, multiple: bool) -> Layer:
     """An opaque base under a region, as Fourier modes."""
+    if isinstance(base, Conductor) and base.is_smooth:
+        return Layer(Parts(None), mirror_top=jnp.stack(base.reflectance(region.cosine))[:, None])
     weight = projected_weight(region)
     is_metal = isinstance(base, Conductor)
     kernels = modes_at_nodes(base.evaluate, region, region, modes, has_mirror_lobe=is_metal)

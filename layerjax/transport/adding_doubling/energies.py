@@ -6,7 +6,8 @@ facets instead. The nodes give what becomes of the light that continues, and of 
 of these, which vary slowly; shares add up to 1 where nothing is lost, and so does the albedo, however coarse the nodes.
 """
 
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 from jax import Array
@@ -18,27 +19,39 @@ from layerjax.stack import Interface, Stack
 from layerjax.transport.adding_doubling.facet_scattering import Normals, refracted_rays
 from layerjax.transport.adding_doubling.operators import Layer, Operator, Parts
 from layerjax.transport.adding_doubling.requested_directions import requested_region
-from layerjax.transport.first_order import FirstOrder, ReflectingInterface
+from layerjax.transport.first_order import FirstOrder, ReflectingInterface, SmoothOrder
 from layerjax.transport.single_scattering import Media, SingleScattering
+from layerjax.transport.specular import Window
 
 LEAST_SHARED = 5e-5
 """Energy below which shares of it are those of light from all directions."""
 
 
 class OuterFace(NamedTuple):
-    """What the layer that light meets first reflects and transmits."""
+    """What the layer that light meets first reflects and transmits; entering: of a smooth one (or of none, where a
+    smooth interface lies behind media), the share that passes."""
 
     reflect: Parts
     transmit: Parts
+    entering: Operator = None
 
 
 def outer_faces(stack: Stack, layers: list[Layer]) -> tuple[OuterFace | None, OuterFace | None]:
     """The layer that light from above meets first, and from below, where they are interfaces."""
-    parts = (*stack.layers, stack.base)
     first, last = layers[0], layers[-1]
-    above = OuterFace(first.reflect_top, first.transmit_down) if isinstance(parts[0], Interface) else None
-    leaves = stack.base is None and isinstance(stack.layers[-1], Interface)
-    return above, OuterFace(last.reflect_bottom, last.transmit_up) if leaves else None
+    above = _outer_face(stack.layers, first.reflect_top, first.transmit_down, first.direct_down)
+    if stack.base is not None:
+        return above, None
+    return above, _outer_face(stack.layers[::-1], last.reflect_bottom, last.transmit_up, last.direct_up)
+
+
+def _outer_face(layers: Sequence[Any], reflect: Parts, transmit: Parts, direct: Operator) -> OuterFace | None:
+    """Layers in the order in which light meets them, and what the first does."""
+    first = next((layer for layer in layers if isinstance(layer, Interface)), None)
+    if first is not None and first.is_smooth:
+        assert direct is not None
+        return OuterFace(Parts(None), Parts(None), direct if first is layers[0] else jnp.ones_like(direct))
+    return OuterFace(reflect, transmit) if first is not None and first is layers[0] else None
 
 
 def node_shares(whole: OuterFace, face: OuterFace | None, weight: Array) -> Array:
@@ -54,6 +67,11 @@ def node_shares(whole: OuterFace, face: OuterFace | None, weight: Array) -> Arra
         leaving = jnp.sum(flux[:, 0], axis=-2)
         return jnp.repeat(leaving, weight.size // leaving.shape[-1], axis=-1)
 
+    if face is not None and face.entering is not None:
+        entered = jnp.repeat(face.entering[:, 0], weight.size // face.entering.shape[-1], axis=-1)
+        near, far = energy(whole.reflect.total), energy(whole.transmit.total)
+        rows = [jnp.zeros_like(near), _share(near, entered, weight), _share(far, entered, weight)]
+        return _stack_rows(rows)
     once, again, far = energy(whole.reflect.first), energy(whole.reflect.rest), energy(whole.transmit.total)
     if face is None:
         rows = [jnp.zeros_like(once), _share(again, 1.0 - once, weight), _share(far, 1.0 - once, weight)]
@@ -62,8 +80,11 @@ def node_shares(whole: OuterFace, face: OuterFace | None, weight: Array) -> Arra
         lost = 1.0 - once - energy(face.transmit.first)
         rows = [_share(1.0 - once - entered, lost, weight), _share(again - back, entered, weight)]
         rows.append(_share(far, entered, weight))
-    channels = max(row.shape[0] for row in rows)
-    return jnp.stack([jnp.broadcast_to(row, (channels, weight.size)) for row in rows])
+    return _stack_rows(rows)
+
+
+def _stack_rows(rows: list[Array]) -> Array:
+    return jnp.stack(jnp.broadcast_arrays(*rows))
 
 
 def _share(part: Array, whole: Array, weight: Array) -> Array:
@@ -75,18 +96,24 @@ def _share(part: Array, whole: Array, weight: Array) -> Array:
 
 
 def directional_albedo(
-    first: FirstOrder, shares: list[Channels], wi: Vector, nodes: int, multiple: bool
+    first: FirstOrder | SmoothOrder, shares: list[Channels], wi: Vector, nodes: int, multiple: bool
 ) -> tuple[Channels, Channels]:
     """Energy that leaves on wi's side and on the other; shares: the three of `node_shares` along wi."""
     single = SingleScattering()
     sides = [(first.upper, wi)] + ([] if first.lower is None else [(first.lower, flip(wi))])
-    once = total([single.albedo(media, w, nodes)[0] for media, w in sides])
-    lost = total([(_masking_loss(media, w, once[0], nodes),) for media, w in sides])
+    faces = [(media, w) for media, w in sides if isinstance(media, Media)]
+    zero = jnp.zeros_like(wi[2])
+    once = total([single.albedo(media, w, nodes)[0] for media, w in faces], zero)
+    lost = total([(_masking_loss(media, w, once[0], nodes),) for media, w in faces], zero)
     near, far = clip_negative(*shares[1:])
     stays = map_channels(
         lambda once, lost, out: clamp_max(clamp_min(lost * out, 0.0), clamp_min(1.0 - once, 0.0)), once, lost, shares[0]
     )
     inside = map_channels(lambda once, stays: clamp_min(1.0 - once - stays, 0.0), once, stays)
+    for window, w in sides:
+        if isinstance(window, Window):
+            # of the two sides, turned to above, one is lit
+            inside = select(w[2] > 0, window.cross(w)[1], inside)
     parts = [once, multiply(inside, near)] + ([stays] if multiple else [])  # else masking absorbs it
     visible = jnp.abs(wi[2]) > horizon(wi[2].dtype)
     if first.lower is None:

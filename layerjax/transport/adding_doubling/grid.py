@@ -64,12 +64,14 @@ class Region(eqx.Module):
 
 
 class Grid(eqx.Module):
-    """Nodes of all panels in s, and the regions from top to bottom."""
+    """Nodes of all panels in s, and the regions from top to bottom. common: whether all regions have the same nodes,
+    also in a panel that regions of slightly different indices share."""
 
     edges: Array
     least_width: Array
     regions: tuple[Region, ...]
     nodes: int = eqx.field(static=True)
+    common: bool = eqx.field(static=True, default=False)
 
     @property
     def interfaces(self) -> int:
@@ -84,9 +86,11 @@ class Grid(eqx.Module):
     def bounds(self, panel: Array | np.ndarray, squared_index: Array) -> tuple[Array, Array]:
         """Lower and upper end in s^2 of panels, in regions of this squared index.
 
-        A panel that regions share ends for each of them where its own directions do.
+        A panel that regions share ends for each of them where its own directions do, unless nodes are common.
         """
         low, high = jnp.concatenate([jnp.zeros(1, self.edges.dtype), self.edges[:-1]])[panel], self.edges[panel]
+        if self.common:
+            return low, high
         return low, jnp.where(jnp.abs(high - squared_index) < self.least_width, squared_index, high)
 
     @property
@@ -101,13 +105,16 @@ def join_regions(first: Region, second: Region) -> Region:
     return eqx.tree_at(lambda region: region.ior, parts, first.ior)
 
 
-def make_grid(indices: Sequence[Any], ranks: tuple[int, ...] | None, nodes: int, dtype: Any) -> Grid:
+def make_grid(
+    indices: Sequence[Any], ranks: tuple[int, ...] | None, nodes: int, dtype: Any, *, common: bool = False
+) -> Grid:
     """Grid for regions of these refractive indices.
 
     Args:
         indices: index of each region, from top to bottom, relative to the surroundings.
         ranks: the place of each region's index among the distinct ones, if that is known; None: found by sorting.
         nodes: nodes a panel.
+        common: see `Grid`; for smooth interfaces, which refract nodes to nodes.
     """
     squares = jnp.stack([jnp.asarray(n, dtype) ** 2 for n in indices])
     if ranks is None:
@@ -116,13 +123,14 @@ def make_grid(indices: Sequence[Any], ranks: tuple[int, ...] | None, nodes: int,
         edges = jnp.stack([squares[ranks.index(rank)] for rank in range(max(ranks) + 1)])
     x, w = (jnp.asarray(array, dtype) for array in gauss_legendre(nodes))
     least_width = (MERGE_SHARE * x[0]) ** 2
-    grid = Grid(_merge_edges(edges, least_width), least_width, (), nodes)
+    grid = Grid(_merge_edges(edges, least_width), least_width, (), nodes, common)
+    beyond = least_width if common else 0.0
     x2 = (x * x)[None]
     regions = []
     for n2 in squares:
         low, high = grid.bounds(grid.panels, n2)
         width = high - low
-        exists = (high <= n2) & (width > 0)
+        exists = (high <= n2 + beyond) & (width > 0)
         cosine2 = jnp.where(exists, (n2 - high + x2 * width) / n2, 0.25)
         cosine = jnp.sqrt(clamp_min(cosine2, COSINE_FLOOR**2))
         sine = jnp.sqrt(jnp.where(exists, (high - x2 * width) / n2, 0.75))

@@ -1,9 +1,9 @@
-"""Rough interfaces on the grid.
+"""Interfaces on the grid.
 
-What a face reflects is its BRDF at the nodes, scaled to the energy that its visible facets reflect. What it refracts
-is found facet by facet: those visible from a node are integrated over by quadrature, and what each passes is put
-(*deposited*) on the nodes around (see `grid.interpolation_weights`). The energy is that of the quadrature at any
-roughness.
+A smooth one sends nodes to nodes. What a rough face reflects is its BRDF at the nodes, scaled to the energy that its
+visible facets reflect. What it refracts is found facet by facet: those visible from a node are integrated over by
+quadrature, and what each passes is put (*deposited*) on the nodes around (see `grid.interpolation_weights`). The energy
+is that of the quadrature at any roughness.
 """
 
 from collections.abc import Sequence
@@ -118,6 +118,17 @@ def interface_layer(
         )
     outer, into, out, inner = (_add_channel_axis(parts) for parts in operators)
     return Layer(outer, inner, into, out) if enters else Layer(inner, outer, out, into)
+
+
+def smooth_layer(above: Region, below: Region) -> Layer:
+    """Smooth dielectric interface between two regions, whose nodes it refracts to each other."""
+    dtype = above.cosine.dtype
+    crosses = above.exists & below.exists
+    level = fresnel.dielectric_towards(above.cosine, below.ior / above.ior, below.cosine, crosses)
+    # light that two faces reflect totally would go back and forth for ever: a little is lost
+    mirrored = clamp_max(level, 1.0 - LEAK * float(jnp.finfo(dtype).eps))[None, None]
+    passed = jnp.where(crosses, 1.0 - level, 0.0)[None, None]
+    return Layer(Parts(None), direct_down=passed, direct_up=passed, mirror_top=mirrored, mirror_bottom=mirrored)
 
 
 def _add_channel_axis(parts: Parts) -> Parts:

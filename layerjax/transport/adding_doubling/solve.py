@@ -24,13 +24,14 @@ from layerjax.transport.adding_doubling.elements import Make, Scalars, build_ele
 from layerjax.transport.adding_doubling.energies import OuterFace, outer_faces
 from layerjax.transport.adding_doubling.facet_scattering import Normals
 from layerjax.transport.adding_doubling.grid import Grid, Region, make_grid
-from layerjax.transport.adding_doubling.interfaces import NextEvent, interface_layer
+from layerjax.transport.adding_doubling.interfaces import NextEvent, interface_layer, smooth_layer
 from layerjax.transport.adding_doubling.media import Kernel, kernel_modes, kernel_ordinates, medium_layer
 from layerjax.transport.adding_doubling.moments import terms
 from layerjax.transport.adding_doubling.operators import Layer, add
 from layerjax.transport.adding_doubling.requested_directions import requested_region
 from layerjax.transport.adding_doubling.resolution import Resolution, is_tilted
 from layerjax.transport.known_directions import DirectionLookup, KnownDirections
+from layerjax.transport.specular import is_smooth
 
 MANY = 3
 """Interfaces of a kind from which on they share a program."""
@@ -49,14 +50,17 @@ class Plan(eqx.Module):
     azimuths: int | None = eqx.field(static=True)
     ranks: tuple[int, ...] | None = eqx.field(static=True)
     multiple: bool = eqx.field(static=True)
+    common: bool = eqx.field(static=True, default=False)
+    """Whether all regions have the same nodes, which smooth interfaces refract to each other."""
 
 
 def make_plan(stack: Stack, resolution: Resolution, multiple: bool) -> Plan:
     """The plan for a simplified stack."""
+    common = any(map(is_smooth, stack.layers))
     if any(map(is_tilted, stack.layers)):
         nodes, azimuths = resolution.ordinates
-        return Plan(nodes, azimuths // 2 + 1, azimuths, ranks(stack), multiple)
-    return Plan(resolution.nodes, resolution.modes, None, ranks(stack), multiple)
+        return Plan(nodes, azimuths // 2 + 1, azimuths, ranks(stack), multiple, common)
+    return Plan(resolution.nodes, resolution.modes, None, ranks(stack), multiple, common)
 
 
 def solve(
@@ -96,7 +100,7 @@ def assemble(
 ) -> tuple[Grid, Layer, Layer, tuple[OuterFace | None, OuterFace | None]]:
     """See `solve`; elements: see `make_elements`. Of a base it only matters whether there is one."""
     dtype = _dtype(stack)
-    grid = make_grid(_indices(stack, dtype), plan.ranks, plan.nodes, dtype)
+    grid = _grid(plan, _indices(stack, dtype), dtype)
     solved: list[tuple[Layer, bool]] = []
     for layer, found in zip((*stack.layers, stack.base), elements, strict=False):
         if isinstance(layer, Medium):
@@ -134,6 +138,10 @@ def without_base(stack: Stack) -> Layers:
     return Layers(stack.layers, stack.base is not None, _dtype(stack))
 
 
+def _grid(plan: Plan, indices: Scalars, dtype: Any) -> Grid:
+    return make_grid(indices, plan.ranks, plan.nodes, dtype, common=plan.common)
+
+
 def _indices(stack: Stack, dtype: Any) -> Scalars:
     """Refractive indices of all regions."""
     faces = [layer for layer in stack.layers if isinstance(layer, Interface)]
@@ -156,6 +164,9 @@ def _interfaces(
     layers: dict[int, Layer] = {}
     by_kind: dict[tuple[Distribution, bool], list[int]] = defaultdict(list)
     for region, layer in enumerate(interfaces):
+        if layer.is_smooth:
+            layers[region] = make(_smooth_interface, (plan, region), indices, None, dtype)
+            continue
         leaves = stack.base is None and 1 < region + 1 == len(interfaces)
         if requested is not None and (layer is stack.layers[0] or leaves):
             options = plan, layer.distribution, not leaves, next_event, region
@@ -190,7 +201,7 @@ def _interface(
 ) -> Layer:
     indices, alpha = numbers
     dtype = indices[0].dtype
-    grid = make_grid(indices, plan.ranks, plan.nodes, dtype)
+    grid = _grid(plan, indices, dtype)
     above, below = (_region(grid, place) for place in (region, region + 1))
     outside = None if requested is None else requested_region(requested, (above if enters else below).ior)
     normals = Normals(jnp.asarray(alpha, dtype), distribution)
@@ -205,6 +216,11 @@ def _interface(
         requested=outside,
         next_event=next_event,
     )
+
+
+def _smooth_interface(plan: Plan, region: int, indices: Scalars, _: None) -> Layer:
+    grid = _grid(plan, indices, indices[0].dtype)
+    return smooth_layer(grid.regions[region], grid.regions[region + 1])
 
 
 def _numbered_interface(
@@ -240,7 +256,7 @@ def _region(grid: Grid, place: int | Array) -> Region:
 
 def _kernel(plan: Plan, region: int, fresnel: bool, tilted: bool, dtype: Any, numbers: Any, _: None) -> Kernel:
     indices, phase = numbers
-    here = make_grid(indices, plan.ranks, plan.nodes, dtype).regions[region]
+    here = _grid(plan, indices, dtype).regions[region]
     if not tilted:
         return kernel_modes(phase, fresnel, here, plan.modes, terms(plan.nodes, len(indices) > 1))
     assert plan.azimuths is not None
@@ -249,7 +265,7 @@ def _kernel(plan: Plan, region: int, fresnel: bool, tilted: bool, dtype: Any, nu
 
 def _base(plan: Plan, region: int, dtype: Any, numbers: Any, _: None) -> Layer:
     indices, base = numbers
-    here = make_grid(indices, plan.ranks, plan.nodes, dtype).regions[region]
+    here = _grid(plan, indices, dtype).regions[region]
     return base_layer(here, _relative_conductor(base, here.ior), plan.modes, plan.multiple)
 
 
@@ -257,8 +273,12 @@ def requested_stack(stack: Stack, known: DirectionLookup) -> tuple[Stack, KnownD
     """The stack with directions that can stand in the place of the grid's outer ones, if there are such.
 
     What ends with a medium is closed where nothing is requested below: light that leaves it there does not come back.
+    A smooth interface lets in none that is not along the nodes.
     """
+    outer = [layer for layer in (*stack.layers[:1], *stack.layers[-1:]) if isinstance(layer, Interface)]
     if any(map(is_tilted, stack.layers)) or not stack.layers or not isinstance(stack.layers[0], Interface):
+        return None
+    if outer[0].is_smooth or (stack.base is None and outer[-1].is_smooth):
         return None
     directions = known()
     if directions is None:

@@ -1,6 +1,7 @@
 """Where the several-event part of a solved stack is read off: tables over directions, cubic between their points.
 
 What is tabulated is f / ior_o^2 (mu_i + mu_o), a smooth function down to grazing light on both sides, made reciprocal.
+Where the outermost layer is a smooth interface it is f / ior_o^2 over what that passes either way.
 A table is finer than the grid: polynomials in the cosine and Fourier series in azimuth carry the values over. Modes are
 summed at its azimuths, 0 to pi, so that a pair reads 64 numbers however many modes there are.
 """
@@ -23,6 +24,7 @@ from layerjax.transport.adding_doubling.grid import Grid, Region, stencil, table
 from layerjax.transport.adding_doubling.interpolate import Axis, look_up
 from layerjax.transport.adding_doubling.operators import Layer, Operator, rotate
 from layerjax.transport.contract import Side
+from layerjax.transport.specular import Window
 
 AZIMUTH_DENSITY = 2
 """Azimuths of a table for each ordinate of the grid."""
@@ -46,16 +48,20 @@ class Tables(eqx.Module):
     grid: Grid
     values: tuple[Array, ...] | None
     energies: tuple[Array, ...]
+    windows: tuple[Window | None, Window | None]
+    """Smooth interfaces that light from above meets first, and from below."""
     opaque: bool = eqx.field(static=True)
     azimuths: int | None = eqx.field(static=True)
     steps: int | None = eqx.field(static=True)
 
 
 class _End(NamedTuple):
-    """The medium above or below the stack: its nodes, and matrices from values there to the points of a table."""
+    """The medium above or below the stack: its nodes, matrices from values there to the points of a table, and what a
+    smooth interface passes of light along the nodes (None: there is none)."""
 
     region: Region
     lift: Array
+    passed: Array | None
 
 
 def make_tables(
@@ -67,6 +73,7 @@ def make_tables(
     interaction_probability: Callable[[Vector], Channels | None],
     faces: tuple[OuterFace | None, OuterFace | None] | None,
     peak_probability: Callable[[Vector], Channels | None] | None,
+    windows: tuple[Window | None, Window | None],
 ) -> Tables:
     """Tables of a solved stack.
 
@@ -79,10 +86,14 @@ def make_tables(
         interaction_probability: that light along a direction meets an event at all, per channel (None: 1).
         faces: see `outer_faces`; None, if there are no interfaces.
         onward_probability: of what does, that the layers have it as passing untouched (None: 0).
+        windows: see `Tables`.
     """
     modes = max(flux.shape[1] for flux in jax.tree.leaves(whole))
     steps = None if azimuths is not None or modes == 1 else MODE_DENSITY * modes
-    top, bottom = (_End(region, _lift(grid, region, modes, azimuths)) for region in (grid.regions[0], grid.regions[-1]))
+    top, bottom = (
+        _End(region, _lift(grid, region, modes, azimuths), None if window is None else _passed(window, region))
+        for region, window in zip((grid.regions[0], grid.regions[-1]), windows, strict=True)
+    )
     values = _values(rest, top, bottom, azimuths, steps, opaque)
 
     lit = [(top, OuterFace(whole.reflect_top, whole.transmit_down), 1.0)]
@@ -102,7 +113,12 @@ def make_tables(
             )
     shape = (max(energy.shape[0] for row in rows for energy in row), rows[0][0].shape[-1])
     energies = tuple(jnp.stack([jnp.broadcast_to(e, shape) for e in each]) for each in zip(*rows, strict=True))
-    return Tables(grid, values, energies, opaque, azimuths, steps)
+    return Tables(grid, values, energies, windows, opaque, azimuths, steps)
+
+
+def _passed(window: Window, region: Region) -> Array:
+    """What a smooth interface passes of light along the nodes."""
+    return window.cross((region.sine, jnp.zeros_like(region.sine), region.cosine))[1][0]
 
 
 def _values(
@@ -145,11 +161,20 @@ def _quadrant(
         return None
     count = azimuths or 1
     mean = 0.5 * (flux + jnp.swapaxes(reverse, -1, -2))
-    values = mean * (jnp.repeat(out.region.cosine, count)[:, None] + jnp.repeat(into.region.cosine, count))
+    if out.passed is None and into.passed is None:
+        values = mean * (jnp.repeat(out.region.cosine, count)[:, None] + jnp.repeat(into.region.cosine, count))
+    else:
+        leaving, entering = (jnp.repeat(_share_passed(end), count) for end in (out, into))
+        values = safe_div(mean, jnp.broadcast_to(jnp.outer(leaving, entering), mean.shape))
     fine = out.lift @ values @ jnp.swapaxes(into.lift, -1, -2)
     if steps is None:
         return fine[:, 0]
     return jnp.einsum("cmij,mp->cijp", fine, jnp.asarray(_waves(values.shape[1], steps), fine.dtype))
+
+
+def _share_passed(end: _End) -> Array:
+    """What a smooth interface passes along every node, 1 where there is none."""
+    return jnp.ones_like(end.region.cosine) if end.passed is None else jnp.where(end.region.exists, end.passed, 0.0)
 
 
 def _energy(flux: Operator, onward: Channels | None, share: Channels | None, end: _End) -> Array:
@@ -171,7 +196,7 @@ def read_rest(tables: Tables, wi: Vector, wo: Vector, side: Side) -> Channels:
     top, bottom = tables.grid.regions[0].ior, tables.grid.regions[-1].ior
     if tables.opaque or side == "reflection":
         valid = (wi[2] > edge) & (wo[2] > edge)
-        quadrant, scale = jnp.zeros((), jnp.int32), jnp.ones(())
+        quadrant, scale = jnp.zeros((), jnp.int32), jnp.ones_like(top)
         out, into, ior_out, ior_into = wo, wi, top, top
     else:
         valid = (jnp.abs(wi[2]) > edge) & (jnp.abs(wo[2]) > edge)
@@ -191,9 +216,25 @@ def read_rest(tables: Tables, wi: Vector, wo: Vector, side: Side) -> Channels:
     ]
     if tables.steps is not None:
         axes.append(_azimuth_points(into, out, tables.steps))
-    factor = jnp.where(valid, scale / (out[2] + into[2]), 0.0)
+    factor = jnp.where(valid, scale * _weight(tables, out, into, quadrant), 0.0)
     found = look_up(tables.values, start, axes)
     return tuple(factor * value for value in found)
+
+
+def _weight(tables: Tables, out: Vector, into: Vector, quadrant: Array) -> Array:
+    """What values are in proportion to, of directions both turned to above; quadrants: see `Tables`."""
+    sum_of_cosines = 1.0 / (out[2] + into[2])
+    if tables.windows == (None, None):
+        return sum_of_cosines
+    top, bottom = (
+        None if window is None else [window.cross(w)[1][0] for w in (out, into)] for window in tables.windows
+    )
+    above = sum_of_cosines if top is None else top[0] * top[1]
+    if tables.opaque:
+        return above
+    below = sum_of_cosines if bottom is None else bottom[0] * bottom[1]
+    across = (1.0 if bottom is None else bottom[0]) * (1.0 if top is None else top[1])
+    return jnp.where(quadrant == 0, above, jnp.where(quadrant == 1, below, across))
 
 
 def read_energies(tables: Tables, wi: Vector) -> list[Channels]:

@@ -21,6 +21,7 @@ from layerjax.transport.lobes.statistics import (
     Options,
     Statistics,
     bound_alpha,
+    facet_width,
     lobe_roughness,
     metal_levels,
     precision,
@@ -41,19 +42,22 @@ index of what it is in), and whether it is smooth."""
 
 
 class MicrofacetLobe(NamedTuple):
-    """A lobe by its energy, its energy over that of the unscaled lobe, and its roughness; None: the facet itself."""
+    """A lobe by its energy, its energy over that of the unscaled lobe, and its roughness (None: the facet itself); and
+    whether it is a delta, of light that has met smooth surfaces alone."""
 
     energy: Channels
     scale: Channels
     alpha: Channels | None
+    specular: bool
 
 
 class _Lobe(NamedTuple):
-    """A lobe by its energy, its variance (None: the facet itself) and its cosine."""
+    """A lobe by its energy, its variance (None: the facet itself) and its cosine; and whether it is a delta."""
 
     energy: Channels
     variance: Channels | None
     cosine: Array
+    specular: bool
 
 
 class MicrofacetLobes(NamedTuple):
@@ -62,6 +66,13 @@ class MicrofacetLobes(NamedTuple):
     reflected: tuple[MicrofacetLobe, ...]
     transmitted: tuple[MicrofacetLobe, ...]
     facet: Facet | None
+
+    def without_deltas(self) -> "MicrofacetLobes":
+        """The lobes that have a width."""
+        reflected, transmitted = (
+            tuple(lobe for lobe in side if not lobe.specular) for side in (self.reflected, self.transmitted)
+        )
+        return self._replace(reflected=reflected, transmitted=transmitted)
 
     def energies(self, dark: Array) -> tuple[Channels, Channels]:
         """Energies of all lobes on the side of the light and on the other, added to zeros."""
@@ -81,7 +92,7 @@ class MicrofacetLobes(NamedTuple):
     def _width(self, lobe: MicrofacetLobe) -> Array:
         if lobe.alpha is None:
             assert self.facet is not None
-            return jnp.asarray(self.facet[0].alpha)
+            return facet_width(self.facet[0])
         return bound_alpha(channels.mean(lobe.alpha))
 
 
@@ -100,7 +111,7 @@ def microfacet_lobes(stack: Stack, options: Options, cosine: Array, upward: bool
 
 def _scale(lobe: _Lobe, alpha: Channels, unscaled: Channels) -> MicrofacetLobe:
     scale = map_channels(lambda energy, whole: energy / clamp_min(whole, LEAST_ENERGY), lobe.energy, unscaled)
-    return MicrofacetLobe(lobe.energy, scale, alpha or None)
+    return MicrofacetLobe(lobe.energy, scale, alpha or None, lobe.specular)
 
 
 def index_below(stack: Stack) -> Array:
@@ -139,7 +150,7 @@ def _reflected_lobes(statistics: Statistics, cosine: Array) -> tuple[list[_Lobe]
                 facet = entry.facet
             else:
                 sigma = _order_variance(entry.lobe.variance, entry.spread, order)
-            lobes.append(_Lobe(energy, sigma, cosine))
+            lobes.append(_Lobe(energy, sigma, cosine, entry.specular and order == 0))
     return lobes, facet
 
 
@@ -161,7 +172,8 @@ def _transmitted_lobes(stack: Stack, statistics: Statistics, cosine: Array, upwa
     for order, energy in enumerate(statistics.transmitted.energy):
         if order > 0 or met:
             sigma = _order_variance(statistics.transmitted.variance, statistics.transmitted_spread, order)
-            lobes.append(_Lobe(energy, tuple(widening * part for part in sigma), here))
+            specular = statistics.transmitted_specular and order == 0
+            lobes.append(_Lobe(energy, tuple(widening * part for part in sigma), here, specular))
     return lobes, leaves / reference
 
 
@@ -199,4 +211,4 @@ def _facet_energy(what: Interface | Conductor, relative: Array, smooth: bool, co
         return metal_levels(what, cosine, relative, multiple=False, smooth=smooth)
     if smooth:
         return (fresnel.dielectric(cosine, relative),)
-    return (single_reflectance(cosine, jnp.asarray(what.alpha), relative),)
+    return (single_reflectance(cosine, facet_width(what), relative),)

@@ -54,23 +54,25 @@ class Reflection(NamedTuple):
 
     spread: variance that each order of scattering adds, None where nothing scatters. facet: the interface or base that
     reflects, if it is the first one, the ratio of the indices behind and before it (of a conductor: the index of what
-    it is in), and whether it is smooth; else None.
+    it is in), and whether it is smooth; else None. specular: whether what no medium has scattered is a delta.
     """
 
     lobe: Lobe
     spread: Channels | None
     facet: tuple[Interface | Conductor, Array, bool] | None
+    specular: bool
 
 
 class Statistics(NamedTuple):
     """Lobes of light along some cosines: those reflected, and the one transmitted (None over a base).
 
-    transmitted_spread: as `Reflection.spread`, behind the stack.
+    transmitted_spread, transmitted_specular: as those of `Reflection`, behind the stack.
     """
 
     reflected: tuple[Reflection, ...]
     transmitted: Lobe | None
     transmitted_spread: Channels | None
+    transmitted_specular: bool
 
 
 class Part(NamedTuple):
@@ -93,8 +95,14 @@ def precision(stack: Stack) -> Any:
 def smooth_parts(stack: Stack) -> tuple[bool, ...]:
     """Of the layers and a base, which are known while tracing to be as narrow as can be: `Options.smooth`."""
     return tuple(
-        isinstance(part, Interface | Conductor) and is_smooth(part.alpha) for part in (*stack.layers, stack.base)
+        isinstance(part, Interface | Conductor) and (part.is_smooth or is_smooth(part.alpha))
+        for part in (*stack.layers, stack.base)
     )
+
+
+def facet_width(surface: Interface | Conductor) -> Array:
+    """Width of the normals, 0 of a smooth surface."""
+    return jnp.zeros((), jnp.result_type(surface.ior)) if surface.is_smooth else jnp.asarray(surface.alpha)
 
 
 def parts(stack: Stack, upward: bool, smooth: tuple[bool, ...] | None = None) -> list[Part]:
@@ -123,6 +131,7 @@ def statistics(stack: Stack, cosine: Array, options: Options, upward: bool = Fal
     over: Array | None = None  # index above the nearest interface so far
     cosines = [bounded_refracted_cosine(cosine, part.above / met[0].above, STEEPEST)[0] for part in met]
     interfaces = iter(_interfaces(met, cosines, options))
+    specular = True
     for (what, index, below, smooth), here in zip(met, cosines, strict=True):
         if isinstance(what, Medium):
             element, scattered = _medium(what, here, options)
@@ -133,20 +142,21 @@ def statistics(stack: Stack, cosine: Array, options: Options, upward: bool = Fal
                 depth = channels.total([depth, optical])
             _, above = add_element(above, element)
             continue
-        alpha = jnp.asarray(what.alpha)
+        alpha = facet_width(what)
+        specular = specular and what.is_smooth
         if over is not None:  # some of the light on its way up is totally reflected: Eqs. (32-35)
             width = jnp.stack([roughness(sigma + variance(alpha)) for sigma in above.s_t0])
             above = limit_escape(above, tuple(escape_cone_share(here, width, over / index)))
         element = _conductor(what, here, index, options, smooth) if isinstance(what, Conductor) else next(interfaces)
         lobe, above = add_element(above, element)
         relative = index if isinstance(what, Conductor) else below / index
-        reflected.append(Reflection(lobe, spread, None if reflected else (what, relative, smooth)))
+        reflected.append(Reflection(lobe, spread, None if reflected else (what, relative, smooth), specular))
         over = index
     if stack.base is not None:
-        return Statistics(tuple(reflected), None, None)
+        return Statistics(tuple(reflected), None, None, False)
     # what is transmitted is described behind the stack
     behind = None if spread is None else map_channels(jnp.divide, spread, above.jacobian)
-    return Statistics(tuple(reflected), Lobe(above.t0, above.s_t0), behind)
+    return Statistics(tuple(reflected), Lobe(above.t0, above.s_t0), behind, specular)
 
 
 def _mean_spread(depth: Array, spread: Array, optical: Array, mean: Array) -> Array:
@@ -159,7 +169,7 @@ def _interfaces(met: Sequence[Part], cosines: Sequence[Array], options: Options)
     if not chosen:
         return []
     cosine = jnp.stack([cosines[k] for k in chosen])
-    alpha = _rows([jnp.asarray(met[k].what.alpha) for k in chosen], cosine)
+    alpha = _rows([facet_width(met[k].what) for k in chosen], cosine)
     ior = _rows([jnp.asarray(met[k].below / met[k].above) for k in chosen], cosine)
     smooth = [met[k].smooth for k in chosen]
     refracted, exists = bounded_refracted_cosine(cosine, ior, STEEPEST)
@@ -210,7 +220,7 @@ def _dielectric(
 
 
 def _conductor(base: Conductor, cosine: Array, index: Array, options: Options, smooth: bool) -> Element:
-    alpha = jnp.asarray(base.alpha)
+    alpha = facet_width(base)
     levels = metal_levels(base, cosine, index, options.multiple, smooth)
     zero, one = (jnp.zeros_like(cosine),), (jnp.ones_like(cosine),)
     dark = (zero,)  # nothing passes

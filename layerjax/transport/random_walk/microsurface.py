@@ -25,7 +25,7 @@ from layerjax.normals.ggx import ggx_density
 from layerjax.surfaces import Conductor
 from layerjax.surfaces.interface import refraction_lobe
 from layerjax.transport.random_walk.scene import Scene
-from layerjax.transport.random_walk.surfaces import Bounce, base_of, is_base, merge, orient, roughness
+from layerjax.transport.random_walk.surfaces import Bounce, base_of, is_base, is_smooth, merge, orient, roughness
 
 
 class Position(NamedTuple):
@@ -48,19 +48,21 @@ def off_surface(travel: Vector) -> Position:
 
 def has_microsurface(scene: Scene) -> bool:
     """Whether any surface of the scene has facets."""
-    return bool(scene.interfaces) or isinstance(scene.base, Conductor)
+    rough_metal = isinstance(scene.base, Conductor) and not scene.base.is_smooth
+    return not all(scene.is_smooth) or rough_metal
 
 
 def has_facets(scene: Scene, surface: Array | None) -> Array | bool:
     """Whether a surface is walked on: all but diffuse bases."""
+    smooth = is_smooth(scene, surface)
     if scene.base is None or isinstance(scene.base, Conductor):
-        return True
-    return ~jnp.asarray(is_base(scene, surface))
+        return not smooth if isinstance(smooth, bool) else ~smooth
+    return ~jnp.asarray(is_base(scene, surface)) & ~jnp.asarray(smooth)
 
 
 def width(scene: Scene, surface: Array | None) -> Array:
     """GGX width of a surface with facets."""
-    if not isinstance(scene.base, Conductor):
+    if not isinstance(scene.base, Conductor) or scene.base.is_smooth:
         return roughness(scene, surface)
     if not scene.interfaces:
         return scene.base.alpha

@@ -19,6 +19,7 @@ from layerjax.channels import Channels, per_channel, pick
 from layerjax.directions import Vector, add, combine, dot, frame, half_vector, scale, select
 from layerjax.phase import PhaseFunction
 from layerjax.stack import Interface, Stack, is_known, media_of
+from layerjax.surfaces import Conductor
 from layerjax.transport.random_walk.random_numbers import circle
 
 
@@ -37,6 +38,7 @@ class Scene:
         regions: number of regions, one more than interfaces. Region r lies under interface r - 1 and over interface r.
         surfaces: number of surfaces; interface i is surface i, the base comes last.
         levels: for each surface, the number of media above it.
+        places: place of every interface among the layers. is_smooth: whether it is. is_mirrored: any surface is smooth.
         channels: number of channels of the walk.
         colored_depths: whether the channels differ in optical depth.
     """
@@ -47,6 +49,10 @@ class Scene:
         self.media = media_of(stack)
         self.interfaces = [layer for layer in stack.layers if isinstance(layer, Interface)]
         self.base = stack.base
+        self.stack = stack
+        self.places = [place for place, layer in enumerate(stack.layers) if isinstance(layer, Interface)]
+        self.is_smooth = [interface.is_smooth for interface in self.interfaces]
+        self.is_mirrored = any(self.is_smooth) or (isinstance(stack.base, Conductor) and stack.base.is_smooth)
         self.regions = len(self.interfaces) + 1
         self.surfaces = len(self.interfaces) + (self.base is not None)
         self.levels: list[int] = []

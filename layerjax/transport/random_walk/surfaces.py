@@ -12,9 +12,10 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from layerjax import fresnel
 from layerjax._numerics import safe_div
 from layerjax.channels import Channels, pick
-from layerjax.directions import Vector, sanitise, select
+from layerjax.directions import Vector, bend, mirror, sanitise, scale, select
 from layerjax.normals.facets import Distribution, draw_weight, masking, twice_projected_area
 from layerjax.surfaces import Conductor, Surface
 from layerjax.surfaces.interface import (
@@ -66,8 +67,18 @@ def is_base(scene: Scene, surface: Array | None) -> Array | bool:
 
 
 def roughness(scene: Scene, surface: Array | None) -> Array:
-    """Width of the normals of an interface."""
-    return choose(surface, [interface.alpha for interface in scene.interfaces])
+    """Width of the normals of an interface; of a smooth one, which has none, a stand-in."""
+    return choose(surface, [0.5 if interface.is_smooth else interface.alpha for interface in scene.interfaces])
+
+
+def is_smooth(scene: Scene, surface: Array | None) -> Array | bool:
+    """Whether the surface is smooth; a Python bool if all are, or none is."""
+    kinds = list(scene.is_smooth)
+    if scene.base is not None:
+        kinds.append(isinstance(scene.base, Conductor) and scene.base.is_smooth)
+    if all(kinds) or not any(kinds):
+        return all(kinds)
+    return choose(surface, [jnp.asarray(kind) for kind in kinds])
 
 
 def bounce(
@@ -104,18 +115,38 @@ def bounce(
                 sent = (_interface(wi, towards, ior, alpha, distribution) * jnp.abs(towards[2]),)
             return Bounce(sent, wo, wo[2] < 0, (weight,), leaves)
 
-        results.append(_by_distribution(scene, surface, event))
+        smooth = any(scene.is_smooth)
+        met = None if all(scene.is_smooth) else _by_distribution(scene, surface, event)
+        if smooth:
+            ray = _meet_smooth(wi, ior, u3, towards)
+            mask = choose(surface, [jnp.asarray(kind) for kind in (*scene.is_smooth, False)])
+            met = ray if met is None else merge(mask, ray, met)
+        assert met is not None
+        results.append(met)
     if at_base is not False:
         base = base_of(scene)
         assert base is not None
         wo = base.sample(wi, u1, u2)
         leaves = wo[2] > 0
         inside = _clamp_to_upper(wo)
-        share = tuple(_weight(f * inside[2], base.pdf(wi, inside), base) for f in base.evaluate(wi, inside))
+        if isinstance(base, Conductor) and base.is_smooth:
+            share = base.reflectance(wi[2])
+        else:
+            share = tuple(_weight(f * inside[2], base.pdf(wi, inside), base) for f in base.evaluate(wi, inside))
         value: Channels = () if towards is None else base_towards(base, wi, towards)
         results.append(Bounce(value, wo, jnp.zeros_like(leaves), share, leaves))
     result = results[0] if len(results) == 1 else merge(at_base, results[1], results[0])
     return result._replace(direction=orient(result.direction, from_above))
+
+
+def _meet_smooth(wi: Vector, ior: Array, u: Array, target: Vector | None) -> Bounce:
+    """Reflection or refraction at a smooth interface, chosen by Fresnel's shares."""
+    behind, exists = bend(wi, ior)
+    level = fresnel.dielectric_towards(wi[2], ior, behind[2], exists)
+    reflects = (u < level) | ~exists
+    wo = select(reflects, mirror(wi), scale(-1.0, behind))
+    zero, yes = jnp.zeros_like(level), jnp.ones(level.shape, bool)
+    return Bounce(() if target is None else (zero,), wo, ~reflects, (zero + 1.0,), yes)
 
 
 def base_towards(base: Surface, wi: Vector, towards: Vector) -> Channels:
@@ -205,10 +236,10 @@ def exit_density(
 
 def _by_distribution(scene: Scene, surface: Array | None, function: Callable[[Distribution], Any]) -> Any:
     """What the function gives for the normals of the interface; computed for every distribution that there is."""
-    kinds = [interface.distribution for interface in scene.interfaces]
+    kinds = [interface.distribution for interface in scene.interfaces if not interface.is_smooth]
     result = function(kinds[0])
     for other in sorted(set(kinds[1:]) - {kinds[0]}):
-        chosen = choose(surface, [jnp.asarray(kind == other) for kind in kinds])
+        chosen = choose(surface, [jnp.asarray(interface.distribution == other) for interface in scene.interfaces])
         result = jax.tree.map(partial(jnp.where, chosen), function(other), result)
     return result
 

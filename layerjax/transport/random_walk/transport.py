@@ -18,11 +18,12 @@ from layerjax.directions import Vector, flip, half_vector, reflect, sanitise, se
 from layerjax.normals.facets import reflection_pdf, sample
 from layerjax.stack import Interface, Stack
 from layerjax.surfaces.lambertian import sample_cosine
-from layerjax.transport.contract import RandomTransport, Side, require_ggx
+from layerjax.transport.contract import RandomTransport, Side, refuse_smooth, require_ggx
 from layerjax.transport.random_walk.batches import average, replace_invalid
 from layerjax.transport.random_walk.scene import Scene
 from layerjax.transport.random_walk.state import Step
 from layerjax.transport.random_walk.walk import Orders, Walk
+from layerjax.transport.specular import select_specular, specular_draws, specular_probabilities
 
 
 class RandomWalk(RandomTransport):
@@ -53,6 +54,8 @@ class RandomWalk(RandomTransport):
         require_choice("RandomWalk.orders", self.orders, ("all", "first", "multiple"))
 
     def check(self, stack: Stack, names: Sequence[str]) -> None:
+        if self.orders != "all":
+            refuse_smooth(stack, names, f'RandomWalk(orders="{self.orders}")')
         if self.facet_multiple_scattering:
             require_ggx(stack, names, "RandomWalk(facet_multiple_scattering=True)")
 
@@ -109,16 +112,17 @@ class RandomWalk(RandomTransport):
 
     def sample(self, state: Stack, wi: Vector, uniforms: tuple[Array, Array, Array]) -> Vector:
         u, u1, u2 = uniforms
+        rest = 1.0 - sum(specular_probabilities(state, wi))
         side = jnp.where(wi[2] < 0, -1.0, 1.0)
         local = sanitise((wi[0], wi[1], wi[2] * side))
         near, far = _diffuse_shares(state)
         cosine = sample_cosine(u1, u2)
-        wo = select(u < near, cosine, flip(cosine))
+        wo = select(u < near * rest, cosine, flip(cosine))
         facets = _facets(state)
         if facets is not None:
             m = sample(local, facets.alpha, u1, u2, facets.distribution)
-            wo = select(u < near + far, wo, reflect(local, m))
-        return wo[0], wo[1], wo[2] * side
+            wo = select(u < (near + far) * rest, wo, reflect(local, m))
+        return select_specular(state, wi, u, (wo[0], wo[1], wo[2] * side))
 
     def pdf(self, state: Stack, wi: Vector, wo: Vector) -> Array:
         side = jnp.where(wi[2] < 0, -1.0, 1.0)
@@ -130,7 +134,12 @@ class RandomWalk(RandomTransport):
             h, _ = half_vector(local, towards)
             mirrored = reflection_pdf(h, local, facets.alpha, facets.distribution)
             density = density + (1.0 - near - far) * jnp.where(h[2] > 0, mirrored, 0.0)
-        return density
+        return density * (1.0 - sum(specular_probabilities(state, wi)))
+
+    def specular_draws(
+        self, state: Stack, wi: Vector, uniforms: tuple[Array, Array, Array]
+    ) -> tuple[Array, Array, Channels] | None:
+        return specular_draws(state, wi, uniforms[0])
 
 
 def _diffuse_shares(state: Stack) -> tuple[float, float]:
@@ -140,4 +149,4 @@ def _diffuse_shares(state: Stack) -> tuple[float, float]:
 
 
 def _facets(state: Stack) -> Interface | None:
-    return next((layer for layer in state.layers if isinstance(layer, Interface)), None)
+    return next((layer for layer in state.layers if isinstance(layer, Interface) and not layer.is_smooth), None)

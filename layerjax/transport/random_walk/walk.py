@@ -36,6 +36,11 @@ from layerjax.transport.random_walk.next_event import (
     start_aiming,
 )
 from layerjax.transport.random_walk.scene import Scene
+from layerjax.transport.random_walk.specular_exit import (
+    make_specular_goal,
+    specular_contribution,
+    specular_target,
+)
 from layerjax.transport.random_walk.state import (
     Arrival,
     Event,
@@ -79,11 +84,12 @@ class Walk:
         self.orders: Orders = orders
         self.counts = count_orders or orders != "all"
         self.multiple = multiple and microsurface.has_microsurface(scene)
-        self.goal = None if wo is None else make_goal(scene, wo)
-        self.aims = wo is not None and bool(scene.interfaces) and orders != "first"
+        self.ray = make_specular_goal(scene, wo) if wo is not None and scene.is_mirrored else None
+        self.goal = None if wo is None or scene.is_mirrored else make_goal(scene, wo)
+        self.aims = self.goal is not None and bool(scene.interfaces) and orders != "first"
         # where two surfaces enclose a region, light from one may be aimed through the other
         self.adjacent = self.aims and scene.surfaces > 1
-        self.relays = self._may_relay() and wo is not None and orders != "first" and not self.multiple
+        self.relays = self._may_relay() and self.goal is not None and orders != "first" and not self.multiple
         # whether aimed light and light that walks on are weighed against each other
         self.mixes = self.adjacent or self.relays or (self.aims and bool(scene.media))
         self.fades = bool(scene.surfaces) or not scene.lossless or scene.colored_depths
@@ -99,8 +105,12 @@ class Walk:
         path, arrival = self._free_flight(path, u)
         outside = (arrival.escapes, path.direction, weights(path), path.order)
         target = None if self.goal is None else make_target(self.goal, path, arrival)
+        if self.ray is not None:
+            target = specular_target(self.scene, self.ray, path, arrival, u[4])
         path, event = self._scatter(path, arrival, target, u)
         arrived: Channels = ()
+        if self.ray is not None:
+            arrived = specular_contribution(self.scene, self.ray, path, arrival, event, u[4])
         if self.goal is not None and target is not None:
             arrived = contribution(self.scene, self.goal, path, arrival, event, target, self.orders)
             if self.relays:
@@ -151,7 +161,8 @@ class Walk:
         path, collides, medium = free_flight(scene, path, free, u[0])
         arrives, escapes, surface = boundary(scene, path, free & ~collides)
         if path.order is not None:
-            path = path._replace(order=path.order + (collides | arrives))
+            counted = arrives & ~jnp.asarray(surfaces.is_smooth(scene, surface)) if scene.is_mirrored else arrives
+            path = path._replace(order=path.order + (collides | counted))
         if not scene.surfaces:
             return path, Arrival(collides, medium, None, None, escapes)
         at_surface = arrives | ~free

@@ -14,7 +14,7 @@ from layerjax.compiling import is_traced
 from layerjax.directions import Vector
 from layerjax.stack import Interface, Stack, is_known, media_of
 from layerjax.tables import load
-from layerjax.transport.contract import TEXELS, DeterministicTransport, Side
+from layerjax.transport.contract import TEXELS, DeterministicTransport, Side, refuse_smooth
 from layerjax.transport.known_directions import DirectionLookup
 from layerjax.transport.single_scattering import Media, SingleScattering, choices, density, draw
 from layerjax.transport.spongecake.energy_correction import correction_network
@@ -78,6 +78,7 @@ class SpongeCake(DeterministicTransport):
             raise ValueError(f"SpongeCake.proposal: {self.proposal!r} is not one of {allowed}")
 
     def check(self, stack: Stack, names: Sequence[str]) -> None:
+        refuse_smooth(stack, names, "SpongeCake")
         for name, layer in zip(names, stack.layers, strict=True):
             if isinstance(layer, Interface):
                 raise ValueError(

@@ -25,7 +25,7 @@ from jax import Array
 from layerjax._devices import exact_products
 from layerjax._numerics import clamp_max, clamp_min, horizon, safe_div, safe_sqrt
 from layerjax.channels import Channels, multiply, per_channel, pick, select
-from layerjax.directions import Vector, sanitise
+from layerjax.directions import Vector, bend, sanitise
 from layerjax.quadrature import gauss_legendre
 from layerjax.stack import Interface, Stack, media_of, optical_depths
 from layerjax.surfaces import Lambertian, Surface
@@ -36,6 +36,7 @@ from layerjax.transport.adding_doubling.resolution import Resolution
 from layerjax.transport.adding_doubling.solve import Plan, make_plan, solve
 from layerjax.transport.first_order import collision_probability
 from layerjax.transport.lobes.statistics import precision
+from layerjax.transport.specular import Window, smooth_window, specular_shares
 from layerjax.transport.statistical.diffuse import closed_form, indirect_energy
 
 NODES = 24
@@ -105,7 +106,13 @@ def _closed_form(bare: Stack, base: Surface, plan: Plan, dtype: Any) -> DiffuseB
         )
 
     scattered, back = arriving(whole.transmit_down), arriving(whole.reflect_bottom)
-    if whole.direct_down is None:
+    if whole.mirror_bottom is not None:
+        back = back + whole.mirror_bottom[:, 0] * counted
+    first = next((layer for layer in bare.layers if isinstance(layer, Interface)), None)
+    if first is not None and first.is_smooth:
+        ballistic = jnp.zeros_like(counted) if whole.direct_down is None else whole.direct_down[:, 0] * counted
+        incoming, table = scattered + ballistic, _smooth_table(bare, base, grid, scattered)
+    elif whole.direct_down is None:
         incoming, table = scattered, _refracted_table(bare, grid, scattered, plan)
     else:
         ballistic = whole.direct_down[:, 0] * counted
@@ -155,6 +162,24 @@ def _ballistic_table(bare: Stack, base: Surface, grid: Grid, scattered: Array) -
     ballistic = jnp.exp(-sum(depths[1:], depths[0])) * _share(base, points.cosine)
     scattered, at_nodes = _broadcast_pair(scattered, at_nodes)
     return table_values(grid, scattered / at_nodes) * at_points + ballistic
+
+
+def _smooth_table(bare: Stack, base: Surface, grid: Grid, scattered: Array) -> Array:
+    """T at the points of a table, where the first interface is smooth: of what is scattered the share of what enters is
+    interpolated, and what no event meets is known."""
+    top, points = grid.regions[0], table_region(grid, grid.regions[0])
+    window = smooth_window(bare, upward=False) or Window(())
+
+    def along(region: Region) -> Vector:
+        return region.sine, jnp.zeros_like(region.sine), region.cosine
+
+    (at_nodes,), (at_points,) = (window.cross(along(region))[1] for region in (top, points))
+    typical = safe_div(scattered @ top.weight, at_nodes @ top.weight)[:, None]
+    behind = (scattered + LEAST_ENTERING * typical) / (at_nodes + LEAST_ENTERING)
+    passed = jnp.stack(specular_shares(bare, along(points))[1])
+    below, _ = bend(along(points), grid.regions[-1].ior)
+    counted = _share(base, jnp.abs(below[2]))
+    return table_values(grid, behind) * at_points + jnp.multiply(*_broadcast_pair(passed, counted))
 
 
 def _broadcast_pair(a: Array, b: Array) -> tuple[Array, Array]:

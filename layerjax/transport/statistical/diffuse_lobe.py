@@ -58,6 +58,8 @@ def why_no_lobe(stack: Stack, names: Sequence[str]) -> str | None:
     if not stack.layers or not isinstance(stack.layers[0], Interface):
         return "layers: the lobe of a diffuse base needs an Interface on top"
     for name, layer in zip(names, stack.layers, strict=True):
+        if isinstance(layer, Interface) and layer.is_smooth:
+            return f"{name}: the lobe of a diffuse base needs a rough Interface"
         if isinstance(layer, Medium) and not is_known(layer.albedo, 0.0):
             return f"{name}: the lobe of a diffuse base needs media that only absorb (albedo known to be 0)"
     return None

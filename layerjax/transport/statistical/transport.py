@@ -40,6 +40,13 @@ from layerjax.transport.lobes.microfacet import (
     unfold,
 )
 from layerjax.transport.lobes.statistics import Options, Scattering, bound_alpha, smooth_parts
+from layerjax.transport.specular import (
+    has_specular,
+    is_smooth,
+    select_specular,
+    specular_draws,
+    specular_probabilities,
+)
 from layerjax.transport.statistical.coated_base import is_coated, make_coated
 from layerjax.transport.statistical.diffuse_base import make_diffuse
 from layerjax.transport.statistical.diffuse_lobe import make_diffuse_lobe, why_no_lobe
@@ -55,6 +62,8 @@ from layerjax.transport.statistical.streamed_base import is_streamed, make_strea
 
 INDEX_SLACK = 1e-6
 """Of the logarithm of a ratio of indices: those that are given in single precision are rounded."""
+
+BELOW_ONE = 1.0 - 1e-6
 
 LEAST_PAIRS = 8
 """Pairs of directions from which on channels are an axis of the lobes' program. Of fewer (a texel has one), processors,
@@ -83,9 +92,9 @@ class Statistical(DeterministicTransport):
     """Layered statistics: energy and width of the lobes of interfaces and media over a conductor, a diffuse base or
     none.
 
-    Belcour 2018, and de Dinechin & Belcour 2022 for diffuse bases. Supports `Interface`, `Medium` with a
-    Henyey-Greenstein phase function (forward scattering only), and every base. Under layers, a diffuse base that is not
-    Lambertian counts as f = A(i) A(o) / (pi rho), with its directional albedo A and the mean rho of A.
+    Belcour 2018, and de Dinechin & Belcour 2022 for diffuse bases. Supports `Interface`, smooth ones as well, `Medium`
+    with a Henyey-Greenstein phase function (forward scattering only), and every base. Under layers, a diffuse base that
+    is not Lambertian counts as f = A(i) A(o) / (pi rho), with its directional albedo A and the mean rho of A.
 
     The index of an `Interface` has to be 1/4 to 4 times that above it; a traced index beyond that counts as the nearer
     end. Derivatives by indices within 1e-4 of each other are finite but follow the interpolation error of the tables:
@@ -182,6 +191,28 @@ class Statistical(DeterministicTransport):
         return channels.total([found, diffuse_part(state.diffuse, wi, wo)])
 
     def sample(self, state: StatisticalState, wi: Vector, uniforms: tuple[Array, Array, Array]) -> Vector:
+        if not has_specular(state.stack):
+            return self._draw(state, wi, uniforms)
+        u, u1, u2 = uniforms
+        rest = 1.0 - self._specular(state, wi)
+        others = self._draw(state, wi, (jnp.clip(safe_div(u, rest), 0.0, BELOW_ONE), u1, u2))
+        return select_specular(state.stack, wi, u, others)
+
+    def pdf(self, state: StatisticalState, wi: Vector, wo: Vector) -> Array:
+        density = self._density(state, wi, wo)
+        return density * (1.0 - self._specular(state, wi)) if has_specular(state.stack) else density
+
+    def _specular(self, state: StatisticalState, wi: Vector) -> Array:
+        mirrored, passed = specular_probabilities(state.stack, wi)
+        return mirrored + passed
+
+    def specular_draws(
+        self, state: StatisticalState, wi: Vector, uniforms: tuple[Array, Array, Array]
+    ) -> tuple[Array, Array, Channels] | None:
+        return specular_draws(state.stack, wi, uniforms[0])
+
+    def _draw(self, state: StatisticalState, wi: Vector, uniforms: tuple[Array, Array, Array]) -> Vector:
+        """Directions that are no delta's."""
         down = draw(self._lobes(state, wi, False), state.diffuse, wi, uniforms, *_ratios(state))
         if not state.is_open:
             return down
@@ -189,7 +220,8 @@ class Statistical(DeterministicTransport):
         up = draw(self._lobes(state, wi_below, True), None, wi_below, uniforms, *_ratios(state)[::-1])
         return select(wi[2] > 0, down, flip(up))
 
-    def pdf(self, state: StatisticalState, wi: Vector, wo: Vector) -> Array:
+    def _density(self, state: StatisticalState, wi: Vector, wo: Vector) -> Array:
+        """Density of `_draw`."""
         down = density(self._lobes(state, wi, False), state.diffuse, wi, wo, *_ratios(state))
         if not state.is_open:
             return down
@@ -219,13 +251,15 @@ class Statistical(DeterministicTransport):
         """Whether the diffuse part of a simplified stack needs a solve of its own."""
         if stack.base is None or not _is_diffuse(stack.base) or not stack.layers:
             return False
+        if any(map(is_smooth, stack.layers)):
+            return True
         return (
             self.diffuse != "tables" or not self.facet_multiple_scattering or not (is_streamed(stack) or is_hazy(stack))
         )
 
     def _microfacet_lobes(self, state: StatisticalState, cosine: Array, upward: bool) -> MicrofacetLobes:
         options = Options(self.facet_multiple_scattering, self.scattering, self.angles, self.own_side, state.smooth)
-        return microfacet_lobes(state.stack, options, cosine, upward)
+        return microfacet_lobes(state.stack, options, cosine, upward).without_deltas()
 
     def _lobes(self, state: StatisticalState, wi: Vector, upward: bool) -> MicrofacetLobes:
         """For light along wi, above (`upward`: turned up); of light that comes from elsewhere, whatever is finite."""

@@ -5,7 +5,6 @@ import pytest
 
 import layerjax as lj
 from fits import Sphere, Spheres, read, read_slab
-from fits.data.formats.rxt import SMOOTH
 from tests.helpers.data_files import RXT, written
 
 BARE, ONE = RXT.format(spheres=0), RXT.format(spheres=1)
@@ -37,7 +36,7 @@ def test_the_stack_is_the_slab(slab, slides, ior):
     text = BARE.replace("1.4 ", f"{ior} ").replace("1.5 ", f"{slides} ")
     stack = slab(f"{text}1\n0.3\n").stack(2.0, 0.1, lj.HenyeyGreenstein(0.8))
     assert [getattr(layer, "ior", None) for layer in stack.layers] == STACKS[slides, ior]
-    assert all(layer.alpha == SMOOTH for layer in stack.layers if isinstance(layer, lj.Interface))
+    assert all(layer.is_smooth for layer in stack.layers if isinstance(layer, lj.Interface))
     (medium,) = (layer for layer in stack.layers if isinstance(layer, lj.TurbidMedium))
     assert (medium.thickness_mm, medium.mu_s, medium.mu_a) == (2.0, 2.0, 0.1)
 

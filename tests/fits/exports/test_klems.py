@@ -1,5 +1,6 @@
 """Matrices of WINDOW: sums, symmetries and sides, beside the stack; the readers of others are in `test_readers`."""
 
+import itertools
 import xml.etree.ElementTree as ElementTree
 
 import numpy as np
@@ -62,6 +63,20 @@ def test_unscattered_light_stays_in_its_patch(tmp_path):
     passed = np.mean(np.exp(-0.5 / np.sqrt(np.maximum(1.0 - squares, 1e-12))), axis=0)
     found = np.diag(matrix) * projected_solid_angles()
     np.testing.assert_allclose(found, np.repeat(passed, COUNTS), rtol=1e-3, atol=1e-4)
+
+
+def test_panes_mirror_and_pass_light_in_its_own_patch(tmp_path):
+    """A smooth pane has no other light; all of it is there."""
+    fits.export(lj.Stack([lj.Interface(1.5), lj.Interface(1.0)]), tmp_path / "pane.xml", "klems")
+    found = matrices(tmp_path / "pane.xml")
+    shares = []
+    for kind, side in itertools.product(("Reflection", "Transmission"), ("Front", "Back")):
+        matrix = found["Visible", f"{kind} {side}"]
+        assert np.count_nonzero(matrix) == 145
+        shares.append(np.diag(matrix) * projected_solid_angles())
+    np.testing.assert_allclose(shares[0] + shares[2], 1.0, atol=1e-4)
+    np.testing.assert_allclose(shares[0], shares[1], atol=1e-4)
+    assert shares[0][0] == pytest.approx(0.0769, abs=1e-4)
 
 
 def test_colours_are_xyz_and_an_opaque_stack_has_no_back(tmp_path):

@@ -120,13 +120,18 @@ def test_dictionary_round_trip():
         lj.Stack([], base=lj.VMFDiffuse(Free(0.4, 0.0, [0.8, 0.9, 1.0]), Free(0.3, 0.0, 1.0), form="all_orders")),
         lj.Stack([lj.Medium(thickness=1 / 3, phase=lj.HenyeyGreenstein(g=Free(0.1, -0.9, 0.9)), f0=0.04)]),
         lj.Stack([lj.Medium(Free(1.0, 0.1, 10.0, LogUniform()), phase=lj.Rayleigh())], lj.OrenNayar(0.5, 0.3)),
+        lj.Stack([lj.Interface(Free(1.5, 1.3, 1.7))], lj.Conductor(0.2, 3.9)),
         lj.Stack([lj.TurbidMedium(0.2, LAW, 0.5, lj.HenyeyGreenstein(0.3))]),
     ):
         assert_same(stack_from_dict(material_to_dict(stack)), stack)
     stack = jax.tree.map(lambda leaf: leaf.astype("float32"), lj.Stack([], base=lj.Lambertian(albedo=np.float32(0.9))))
     assert material_to_dict(stack) == {"base": {"kind": "Lambertian", "albedo": 0.9}}
+    assert material_to_dict(lj.Stack([lj.Interface(1.5)])) == {
+        "layers": [{"kind": "Interface", "ior": 1.5, "distribution": "ggx", "smooth": True}]
+    }
 
 
+FACE = "[[layers]]\nkind = 'Interface'\nior = 1.5\n"
 FREE = LAYER + "thickness = {{ start = 1, low = 0, high = 2{} }}\n"
 WRONG = {
     "": "neither a layer nor a base",
@@ -145,6 +150,10 @@ WRONG = {
     FREE.format(", prior = { kind = 'Normal', mean = 1, sd = -1 }"): r"layers\[0\].thickness.prior: Normal.sd is -1",
     THIN + "phase = { kind = 'SGGX', shape = 'ball', alpha = 0.1 }\n": r"layers\[0\].phase: SGGX.shape: ",
     BASE + "noise = { discrepancy = { length_half = -3.0 } }\n": "noise.discrepancy.length_half is -3.0",
+    FACE: r"layers\[0\] has no alpha, must have it or smooth = true",
+    FACE + "smoth = true\n": r"unknown key 'smoth' \(did you mean 'smooth'\?\)",
+    FACE + "smooth = 1\n": r"layers\[0\].smooth: 1 is neither true nor false",
+    FACE + "smooth = true\nalpha = 0.1\n": r"layers\[0\].smooth: true, and alpha given as well",
     TINTED.format("{ ior = 1 }"): "base.film has no thickness_nm, which ThinFilm needs",
     TINTED.format("3"): r"base: Conductor\.film: 3 is not a ThinFilm or None",
     BASE + "scale = { start = [1, 1], low = 0.5, high = 2 }\n": "scale has 2 channels, must be one number for all",

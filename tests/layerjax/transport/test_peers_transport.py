@@ -136,3 +136,46 @@ def test_single_surfaces(name, transport):
             tolerance = np.maximum(4 * noise, LEAST * np.maximum(expected, 0.1 * expected.max()))
             assert expected.max() > 0
             assert np.all(np.abs(found - expected) <= tolerance)
+
+
+SMOOTH = {
+    "smooth coat on a diffuse base": lj.Stack([lj.Interface(1.5), haze(0.4, 0.5, 0.9)], lj.Lambertian([0.8, 0.4, 0.2])),
+    "smooth coat on rough metal": lj.Stack([lj.Interface(1.5)], lj.Conductor([0.2, 0.9, 1.5], [3.9, 2.4, 1.9], 0.3)),
+    "rough coat on a mirror": lj.Stack([lj.Interface(1.5, 0.3), haze(0.4, 0.5, 0.9)], lj.Conductor(0.2, 3.9)),
+    "haze between smooth faces": lj.Stack([lj.Interface(1.5), haze(0.4, 1.0, 0.9), lj.Interface(1.0)]),
+    "haze between faces, one rough": lj.Stack([lj.Interface(1.3), haze(0.4, 1.0, 0.9), lj.Interface(1.0, 0.3)]),
+}
+CONE = 0.2
+
+
+@pytest.mark.peers
+@pytest.mark.parametrize("transport", ["deterministic", "walk"])
+@pytest.mark.parametrize("name", SMOOTH)
+def test_smooth_surfaces(name, transport):
+    """Means over a cone of light, away from the delta directions; no path of Mitsuba finds a single one."""
+    stack = SMOOTH[name]
+    solved = {"deterministic": lj.AddingDoubling(), "walk": lj.RandomWalk(paths=1 << 15)}[transport]
+    for wi in lit_from(stack).values():
+        scene, viewer = Volpath(stack, wi, cone=CONE, roulette=50), viewers(stack)
+        value, error = scene.values(viewer, 1 << 20)
+        lights, weight = cone_of(wi)
+        found, noise = evaluated(stack, lights[:, None], viewer, solved)
+        mean = np.tensordot(weight, found, 1)
+        noise = np.sqrt(np.tensordot(weight**2, noise**2, 1))
+        assert np.all(np.abs(mean - value) <= np.maximum(4 * np.hypot(error, noise), LEAST * value))
+
+
+def cone_of(wi):
+    """Directions of the cone about wi and their shares of its light, by Gauss points in the squared sine."""
+    x, w = np.polynomial.legendre.leggauss(5)
+    polar = np.arcsin(np.sin(CONE) * np.sqrt(0.5 * (1 + x)))
+    phi = 2 * pi * (np.arange(8) + 0.5) / 8
+    about = np.cross(wi, [0.3, 0.9, 0.1])
+    about /= np.linalg.norm(about)
+    beside = np.cross(wi, about)
+    turned = np.cos(phi)[:, None] * about + np.sin(phi)[:, None] * beside
+    found = np.cos(polar)[:, None, None] * wi + np.sin(polar)[:, None, None] * turned
+    cosine = np.abs(found[..., 2])
+    # the disc has the same radiance everywhere, and is seen across wi
+    share = (0.5 * w[:, None] / np.cos(polar)[:, None]) * cosine / abs(wi[2])
+    return found.reshape(-1, 3), share.ravel() / phi.size
