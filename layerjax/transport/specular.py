@@ -100,6 +100,12 @@ def specular_probabilities(stack: Stack, w: Vector) -> tuple[Array, Array]:
     return mirrored, passed
 
 
+def specular_probability(stack: Stack, w: Vector) -> Array:
+    """The probability with which a delta is drawn, on either side."""
+    mirrored, passed = specular_probabilities(stack, w)
+    return mirrored + passed
+
+
 def select_specular(stack: Stack, w: Vector, u: Array, others: Vector) -> Vector:
     """The mirror or the refracted direction of light along w by those probabilities, at the end of the unit interval;
     else the others."""

@@ -86,7 +86,7 @@ from layerjax.transport.first_order import (
 )
 from layerjax.transport.known_directions import DirectionLookup, KnownDirections, known_directions
 from layerjax.transport.single_scattering import SingleScattering
-from layerjax.transport.specular import has_specular, is_smooth, select_specular, smooth_window, specular_probabilities
+from layerjax.transport.specular import has_specular, is_smooth, select_specular, smooth_window, specular_probability
 from layerjax.transport.specular import specular_draws as draws_along_deltas
 
 Orders = Literal["all", "first", "multiple"]
@@ -332,7 +332,7 @@ class AddingDoubling(DeterministicTransport):
         if state.stack is None:
             return propose(state.first, wi, uniforms)
         u, u1, u2 = uniforms
-        rest = 1.0 - sum(specular_probabilities(state.stack, wi))
+        rest = 1.0 - specular_probability(state.stack, wi)
         others = propose(state.first, wi, (jnp.clip(safe_div(u, rest), 0.0, BELOW_ONE), u1, u2))
         return select_specular(state.stack, wi, u, others)
 
@@ -343,7 +343,7 @@ class AddingDoubling(DeterministicTransport):
         density = proposal_density(state.first, wi, wo)
         if state.stack is None:
             return density
-        return density * (1.0 - sum(specular_probabilities(state.stack, wi)))
+        return density * (1.0 - specular_probability(state.stack, wi))
 
     def specular_draws(
         self, state: AddingDoublingState, wi: Vector, uniforms: tuple[Array, Array, Array]

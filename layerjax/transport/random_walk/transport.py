@@ -23,7 +23,7 @@ from layerjax.transport.random_walk.batches import average, replace_invalid
 from layerjax.transport.random_walk.scene import Scene
 from layerjax.transport.random_walk.state import Step
 from layerjax.transport.random_walk.walk import Orders, Walk
-from layerjax.transport.specular import select_specular, specular_draws, specular_probabilities
+from layerjax.transport.specular import select_specular, specular_draws, specular_probability
 
 
 class RandomWalk(RandomTransport):
@@ -112,7 +112,7 @@ class RandomWalk(RandomTransport):
 
     def sample(self, state: Stack, wi: Vector, uniforms: tuple[Array, Array, Array]) -> Vector:
         u, u1, u2 = uniforms
-        rest = 1.0 - sum(specular_probabilities(state, wi))
+        rest = 1.0 - specular_probability(state, wi)
         side = jnp.where(wi[2] < 0, -1.0, 1.0)
         local = sanitise((wi[0], wi[1], wi[2] * side))
         near, far = _diffuse_shares(state)
@@ -134,7 +134,7 @@ class RandomWalk(RandomTransport):
             h, _ = half_vector(local, towards)
             mirrored = reflection_pdf(h, local, facets.alpha, facets.distribution)
             density = density + (1.0 - near - far) * jnp.where(h[2] > 0, mirrored, 0.0)
-        return density * (1.0 - sum(specular_probabilities(state, wi)))
+        return density * (1.0 - specular_probability(state, wi))
 
     def specular_draws(
         self, state: Stack, wi: Vector, uniforms: tuple[Array, Array, Array]

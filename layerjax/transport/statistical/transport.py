@@ -45,7 +45,7 @@ from layerjax.transport.specular import (
     is_smooth,
     select_specular,
     specular_draws,
-    specular_probabilities,
+    specular_probability,
 )
 from layerjax.transport.statistical.coated_base import is_coated, make_coated
 from layerjax.transport.statistical.diffuse_base import make_diffuse
@@ -194,17 +194,13 @@ class Statistical(DeterministicTransport):
         if not has_specular(state.stack):
             return self._draw(state, wi, uniforms)
         u, u1, u2 = uniforms
-        rest = 1.0 - self._specular(state, wi)
+        rest = 1.0 - specular_probability(state.stack, wi)
         others = self._draw(state, wi, (jnp.clip(safe_div(u, rest), 0.0, BELOW_ONE), u1, u2))
         return select_specular(state.stack, wi, u, others)
 
     def pdf(self, state: StatisticalState, wi: Vector, wo: Vector) -> Array:
         density = self._density(state, wi, wo)
-        return density * (1.0 - self._specular(state, wi)) if has_specular(state.stack) else density
-
-    def _specular(self, state: StatisticalState, wi: Vector) -> Array:
-        mirrored, passed = specular_probabilities(state.stack, wi)
-        return mirrored + passed
+        return density * (1.0 - specular_probability(state.stack, wi)) if has_specular(state.stack) else density
 
     def specular_draws(
         self, state: StatisticalState, wi: Vector, uniforms: tuple[Array, Array, Array]
