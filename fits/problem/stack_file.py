@@ -221,7 +221,8 @@ def _build(where: str, table: Any, kinds: _Kinds) -> Any:
     numbers = {key: value for key, value in table.items() if key != "kind"}
     if kind not in (lj.Interface, lj.Conductor):
         return _make(where, kind, numbers)
-    return _make(where, kind, _read_roughness(where, numbers), also=("smooth",))
+    check_keys(where, numbers, (*inspect.signature(kind).parameters, "smooth"))
+    return _make(where, kind, _read_roughness(where, numbers))
 
 
 def _read_roughness(where: str, table: dict[str, Any]) -> dict[str, Any]:
@@ -236,13 +237,10 @@ def _read_roughness(where: str, table: dict[str, Any]) -> dict[str, Any]:
     return table
 
 
-def _make(where: str, kind: type, table: Any, also: tuple[str, ...] = ()) -> Any:
-    """The object of this class that a table of its parameters describes; the class itself says what may stand there.
-
-    also: further keys that a file may have there.
-    """
+def _make(where: str, kind: type, table: Any) -> Any:
+    """The object of this class that a table of its parameters describes; the class itself says what may stand there."""
     known = {_key(name): parameter for name, parameter in inspect.signature(kind).parameters.items()}
-    check_keys(where, require_table(where, table), (*known, *also))
+    check_keys(where, require_table(where, table), tuple(known))
     for key, parameter in known.items():
         if parameter.default is inspect.Parameter.empty and key not in table:
             raise ValueError(f"{where} has no {key}, which {kind.__name__} needs")

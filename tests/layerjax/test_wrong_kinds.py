@@ -23,6 +23,7 @@ FUNCTIONS = {
     "sample": {**LIT, "key": KEY, **SINGLE},
     "pdf": {**PAIR, **SINGLE},
     "albedo": {**LIT, **SINGLE, "nodes": 8, "key": KEY},
+    "specular": LIT,
     "unscattered": LIT,
     "metal": {"name": "gold", "wavelengths_nm": 550.0},
     "cauchy": {"wavelengths_nm": 550.0, "a": 1.5, "b": 0.004, "c": 0.0},
@@ -76,7 +77,7 @@ WRONG = {
 NONE_IS_FINE = {
     ("Medium", "f0"), ("TurbidMedium", "f0"), ("Stack", "base"), ("evaluate", "key"), ("albedo", "key"),
     ("AddingDoubling", "nodes"), ("AddingDoubling", "modes"), ("AddingDoubling", "tolerance"), ("SGGX", "axis"),
-    ("Conductor", "film"),
+    ("Conductor", "film"), ("Conductor", "alpha"), ("Interface", "alpha"),
 }  # fmt: skip
 """Arguments that may be left out."""
 
