@@ -42,7 +42,8 @@ def prepare(stack: Stack | Mixture, transport: Transport | Literal["auto"] = "au
     Args:
         stack: the layered material. Of a mixture, each part is prepared, and a mixture of prepared parts is returned.
         transport: the light transport model. ``"auto"`` includes all orders of scattering: it is `SingleScattering` for
-            a base under media that are known to absorb only, where it is exact, and `AddingDoubling` for all others.
+            a base (no mirror) under media that are known to absorb only, where it is exact, and `AddingDoubling` for
+            all others.
 
     Raises:
         ValueError: the stack holds a placeholder, or a layer or base that the transport does not support.
