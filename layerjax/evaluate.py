@@ -6,6 +6,7 @@ that a gradient holds no more than one chunk in memory and accumulates as it goe
 """
 
 import math
+from collections.abc import Callable
 from functools import cache, partial
 from typing import Any, Literal, get_args
 
@@ -266,10 +267,7 @@ def unscattered(stack: Stack | Mixture, wi: ArrayLike) -> Array:
     (wi,) = read_directions(wi=wi)
     if isinstance(stack, Mixture):
         return _broadcast_parts(stack).mean(lambda part, _: unscattered(part, wi))
-    slim, channels, shape = cast_arrays(simplify(stack), wi.dtype), channel_count(stack), map_shape(stack)
-    if shape:
-        return maps.evaluate_texels(_unscattered, slim, maps.layout(shape, wi), wi, channels)
-    return _unscattered(slim, wi, channels)
+    return _evaluate_deltas(_unscattered, stack, wi)
 
 
 @allow_broadcasting
@@ -300,12 +298,16 @@ def specular(stack: Stack | Mixture, wi: ArrayLike) -> tuple[Array, Array]:
     (wi,) = read_directions(wi=wi)
     if isinstance(stack, Mixture):
         return _broadcast_parts(stack).mean(lambda part, _: specular(part, wi))
+    reflected, transmitted = jnp.split(_evaluate_deltas(_specular, stack, wi), 2, axis=-1)
+    return reflected, transmitted
+
+
+def _evaluate_deltas(function: Callable[[Stack, Array, int], Array], stack: Stack, wi: Array) -> Array:
+    """A closed form of a stack, its light and its number of channels; of a map texel by texel."""
     slim, channels, shape = cast_arrays(simplify(stack), wi.dtype), channel_count(stack), map_shape(stack)
     if shape:
-        found = maps.evaluate_texels(_specular, slim, maps.layout(shape, wi), wi, channels)
-    else:
-        found = _specular(slim, wi, channels)
-    return found[..., :channels], found[..., channels:]
+        return maps.evaluate_texels(function, slim, maps.layout(shape, wi), wi, channels)
+    return function(slim, wi, channels)
 
 
 def _evaluate_whole(inputs: tuple[Stack, Transport, KnownDirections | None, Array, Array, Side, int]) -> Array:

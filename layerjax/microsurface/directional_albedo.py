@@ -56,7 +56,7 @@ SMOOTH_ALPHA = 1e-4
 """The least width. Of a surface known to be so narrow the energies are Fresnel's, and no quadrature is needed."""
 
 
-def is_smooth(alpha: Any) -> bool:
+def is_narrowest(alpha: Any) -> bool:
     """Whether a width is known while tracing to be `SMOOTH_ALPHA`."""
     return not isinstance(alpha, jax.core.Tracer) and bool(np.all(np.asarray(alpha) <= SMOOTH_ALPHA))
 

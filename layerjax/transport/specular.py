@@ -4,7 +4,7 @@ Such light keeps n sin(theta) and its azimuth, whatever it crosses, so that two 
 reflected along the mirror direction, and what is transmitted along the refracted one.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import pairwise
 from typing import Any
 
@@ -14,11 +14,13 @@ import jax.numpy as jnp
 from jax import Array
 
 from layerjax import channels, fresnel
-from layerjax._numerics import clamp_min, horizon
+from layerjax._numerics import clamp_min, horizon, safe_div
 from layerjax.channels import Channels, map_channels, multiply
 from layerjax.directions import Vector, bend, flip, mirror, sanitise, select
 from layerjax.stack import Interface, Medium, Stack, optical_depths
 from layerjax.surfaces import Conductor, Surface
+
+BELOW_ONE = 1.0 - 1e-6
 
 LEAST_LOSS = 1e-18
 """The least share of light between two faces that is lost in a turn: total reflection on both sides stays finite."""
@@ -92,32 +94,37 @@ def transmitted_direction(stack: Stack, w: Vector) -> Vector:
 
 
 def specular_probabilities(stack: Stack, w: Vector) -> tuple[Array, Array]:
-    """With which the deltas are drawn where all else is at most the rest of the energy: their energies, mean of the
-    channels."""
-    if not has_specular(stack):
-        return jnp.zeros_like(w[2]), jnp.zeros_like(w[2])
+    """The probabilities with which the deltas are drawn: their energies, mean of the channels. All other light has at
+    most the rest."""
     mirrored, passed = map(channels.mean, specular_shares(stack, w))
     return mirrored, passed
 
 
-def specular_probability(stack: Stack, w: Vector) -> Array:
-    """The probability with which a delta is drawn, on either side."""
-    mirrored, passed = specular_probabilities(stack, w)
-    return mirrored + passed
-
-
-def select_specular(stack: Stack, w: Vector, u: Array, others: Vector) -> Vector:
-    """The mirror or the refracted direction of light along w by those probabilities, at the end of the unit interval;
-    else the others."""
+def sample_with_deltas(
+    stack: Stack, w: Vector, uniforms: tuple[Array, Array, Array], others: Callable[..., Vector]
+) -> Vector:
+    """The mirror or the refracted direction of light along w by those probabilities, at the end of the first unit
+    interval; else what `others` draws from three uniform numbers."""
     if not has_specular(stack):
-        return others
+        return others(uniforms)
+    u, u1, u2 = uniforms
     mirrored, passed = specular_probabilities(stack, w)
-    wo = select(u >= 1.0 - mirrored - passed, mirror(w), others)
+    rest = 1.0 - mirrored - passed
+    wo = others((jnp.clip(safe_div(u, rest), 0.0, BELOW_ONE), u1, u2))
+    wo = select(u >= rest, mirror(w), wo)
     return select(u >= 1.0 - passed, transmitted_direction(stack, w), wo)
 
 
+def density_with_deltas(stack: Stack, w: Vector, density: Array) -> Array:
+    """Density of `sample_with_deltas` off the deltas, from that of the others."""
+    if not has_specular(stack):
+        return density
+    mirrored, passed = specular_probabilities(stack, w)
+    return density * (1.0 - mirrored - passed)
+
+
 def specular_draws(stack: Stack, w: Vector, u: Array) -> tuple[Array, Array, Channels] | None:
-    """Which draws of `select_specular` are deltas, the probability of such a draw, and the energy of the delta."""
+    """Which draws of `sample_with_deltas` are deltas, the probability of such a draw, and the energy of the delta."""
     if not has_specular(stack):
         return None
     mirrored, passed = specular_probabilities(stack, w)

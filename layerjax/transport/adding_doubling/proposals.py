@@ -97,7 +97,7 @@ def layered_density(state: LayeredState, wi: Vector, wo: Vector) -> Array:
     return jnp.where(lit, density, 0.0)
 
 
-def specular_draws(
+def layered_specular_draws(
     state: LayeredState, wi: Vector, uniforms: tuple[Array, Array, Array]
 ) -> tuple[Array, Array, Channels]:
     """Which draws of `propose_layered` are deltas, the probability of such a draw, and the energy of the delta."""

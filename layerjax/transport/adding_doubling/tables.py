@@ -224,7 +224,7 @@ def read_rest(tables: Tables, wi: Vector, wo: Vector, side: Side) -> Channels:
 def _weight(tables: Tables, out: Vector, into: Vector, quadrant: Array) -> Array:
     """What values are in proportion to, of directions both turned to above; quadrants: see `Tables`."""
     sum_of_cosines = 1.0 / (out[2] + into[2])
-    if tables.windows == (None, None):
+    if all(window is None for window in tables.windows):
         return sum_of_cosines
     top, bottom = (
         None if window is None else [window.cross(w)[1][0] for w in (out, into)] for window in tables.windows

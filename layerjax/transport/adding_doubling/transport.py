@@ -43,13 +43,12 @@ from layerjax.transport.adding_doubling.elements import (
 from layerjax.transport.adding_doubling.energies import clip_negative, directional_albedo
 from layerjax.transport.adding_doubling.moments import delta_scale
 from layerjax.transport.adding_doubling.proposals import (
-    BELOW_ONE,
     LayeredState,
     layered_density,
+    layered_specular_draws,
     proposal_density,
     propose,
     propose_layered,
-    specular_draws,
 )
 from layerjax.transport.adding_doubling.requested_directions import RequestedValues, read_requested, requested_values
 from layerjax.transport.adding_doubling.resolution import (
@@ -86,8 +85,14 @@ from layerjax.transport.first_order import (
 )
 from layerjax.transport.known_directions import DirectionLookup, KnownDirections, known_directions
 from layerjax.transport.single_scattering import SingleScattering
-from layerjax.transport.specular import has_specular, is_smooth, select_specular, smooth_window, specular_probability
-from layerjax.transport.specular import specular_draws as draws_along_deltas
+from layerjax.transport.specular import (
+    density_with_deltas,
+    has_specular,
+    is_smooth,
+    sample_with_deltas,
+    smooth_window,
+    specular_draws,
+)
 
 Orders = Literal["all", "first", "multiple"]
 
@@ -142,7 +147,7 @@ class AddingDoubling(DeterministicTransport):
     derivatives by indices, albedos, g, and by the logarithms of widths and thicknesses were within 6e-3 of |f| +
     mean(f) / 10 on 28 random stacks of seven structures. The derivative by a width of 0.05 itself has 20 times this
     scale: for a coat on metal its error was 3e-2 at the 6 nodes chosen, and 3e-3 at 12. Between smooth interfaces the
-    derivative by an index that is just that of another region has no such accuracy: beside it it has.
+    derivative by an index that equals that of another outer region is wrong (0.36 for 0.19 in one case).
 
     Args:
         nodes: cosines per hemisphere (and for each range of angles between critical angles), 2 to 1024. None: chosen
@@ -331,19 +336,14 @@ class AddingDoubling(DeterministicTransport):
             return propose_layered(layered, wi, uniforms)
         if state.stack is None:
             return propose(state.first, wi, uniforms)
-        u, u1, u2 = uniforms
-        rest = 1.0 - specular_probability(state.stack, wi)
-        others = propose(state.first, wi, (jnp.clip(safe_div(u, rest), 0.0, BELOW_ONE), u1, u2))
-        return select_specular(state.stack, wi, u, others)
+        return sample_with_deltas(state.stack, wi, uniforms, partial(propose, state.first, wi))
 
     def pdf(self, state: AddingDoublingState, wi: Vector, wo: Vector) -> Array:
         layered = self._layered(state)
         if layered is not None:
             return layered_density(layered, wi, wo)
         density = proposal_density(state.first, wi, wo)
-        if state.stack is None:
-            return density
-        return density * (1.0 - specular_probability(state.stack, wi))
+        return density if state.stack is None else density_with_deltas(state.stack, wi, density)
 
     def specular_draws(
         self, state: AddingDoublingState, wi: Vector, uniforms: tuple[Array, Array, Array]
@@ -352,11 +352,10 @@ class AddingDoubling(DeterministicTransport):
         if state.stack is None or not has_specular(state.stack):
             return None
         layered = self._layered(state)
-        drawn = (
-            draws_along_deltas(state.stack, wi, uniforms[0])
-            if layered is None
-            else specular_draws(layered, wi, uniforms)
-        )
+        if layered is None:
+            drawn = specular_draws(state.stack, wi, uniforms[0])
+        else:
+            drawn = layered_specular_draws(layered, wi, uniforms)
         if drawn is None or self.orders == "all":
             return drawn
         along, probability, energies = drawn

@@ -16,7 +16,7 @@ from jax import Array
 from layerjax import channels, fresnel
 from layerjax._numerics import clamp_max, clamp_min, unstack
 from layerjax.channels import Channels, map_channels, per_channel
-from layerjax.microsurface.directional_albedo import is_smooth
+from layerjax.microsurface.directional_albedo import is_narrowest
 from layerjax.microsurface.energy_tables import conductor_energies, escape_cone_share, interface_energies
 from layerjax.stack import Interface, Medium, Stack, is_known
 from layerjax.surfaces import Conductor
@@ -95,7 +95,7 @@ def precision(stack: Stack) -> Any:
 def smooth_parts(stack: Stack) -> tuple[bool, ...]:
     """Of the layers and a base, which are known while tracing to be as narrow as can be: `Options.smooth`."""
     return tuple(
-        isinstance(part, Interface | Conductor) and (part.is_smooth or is_smooth(part.alpha))
+        isinstance(part, Interface | Conductor) and (part.is_smooth or is_narrowest(part.alpha))
         for part in (*stack.layers, stack.base)
     )
 

@@ -6,6 +6,7 @@ adds to a BSDF value, `layerjax.transport.random_walk.batches` for how paths sha
 """
 
 from collections.abc import Sequence
+from functools import partial
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -23,7 +24,7 @@ from layerjax.transport.random_walk.batches import average, replace_invalid
 from layerjax.transport.random_walk.scene import Scene
 from layerjax.transport.random_walk.state import Step
 from layerjax.transport.random_walk.walk import Orders, Walk
-from layerjax.transport.specular import select_specular, specular_draws, specular_probability
+from layerjax.transport.specular import density_with_deltas, sample_with_deltas, specular_draws
 
 
 class RandomWalk(RandomTransport):
@@ -111,35 +112,44 @@ class RandomWalk(RandomTransport):
         return near_first(value), near_first(error)
 
     def sample(self, state: Stack, wi: Vector, uniforms: tuple[Array, Array, Array]) -> Vector:
-        u, u1, u2 = uniforms
-        rest = 1.0 - specular_probability(state, wi)
-        side = jnp.where(wi[2] < 0, -1.0, 1.0)
-        local = sanitise((wi[0], wi[1], wi[2] * side))
-        near, far = _diffuse_shares(state)
-        cosine = sample_cosine(u1, u2)
-        wo = select(u < near * rest, cosine, flip(cosine))
-        facets = _facets(state)
-        if facets is not None:
-            m = sample(local, facets.alpha, u1, u2, facets.distribution)
-            wo = select(u < (near + far) * rest, wo, reflect(local, m))
-        return select_specular(state, wi, u, (wo[0], wo[1], wo[2] * side))
+        return sample_with_deltas(state, wi, uniforms, partial(_sample, state, wi))
 
     def pdf(self, state: Stack, wi: Vector, wo: Vector) -> Array:
-        side = jnp.where(wi[2] < 0, -1.0, 1.0)
-        local, towards = sanitise((wi[0], wi[1], wi[2] * side)), (wo[0], wo[1], wo[2] * side)
-        near, far = _diffuse_shares(state)
-        density = jnp.where(towards[2] > 0, near, far) * jnp.abs(towards[2]) / jnp.pi
-        facets = _facets(state)
-        if facets is not None:
-            h, _ = half_vector(local, towards)
-            mirrored = reflection_pdf(h, local, facets.alpha, facets.distribution)
-            density = density + (1.0 - near - far) * jnp.where(h[2] > 0, mirrored, 0.0)
-        return density * (1.0 - specular_probability(state, wi))
+        return density_with_deltas(state, wi, _density(state, wi, wo))
 
     def specular_draws(
         self, state: Stack, wi: Vector, uniforms: tuple[Array, Array, Array]
     ) -> tuple[Array, Array, Channels] | None:
         return specular_draws(state, wi, uniforms[0])
+
+
+def _sample(state: Stack, wi: Vector, uniforms: tuple[Array, Array, Array]) -> Vector:
+    """Directions from cosine lobes and the visible normals of the top interface."""
+    u, u1, u2 = uniforms
+    side = jnp.where(wi[2] < 0, -1.0, 1.0)
+    local = sanitise((wi[0], wi[1], wi[2] * side))
+    near, far = _diffuse_shares(state)
+    cosine = sample_cosine(u1, u2)
+    wo = select(u < near, cosine, flip(cosine))
+    facets = _facets(state)
+    if facets is not None:
+        m = sample(local, facets.alpha, u1, u2, facets.distribution)
+        wo = select(u < near + far, wo, reflect(local, m))
+    return wo[0], wo[1], wo[2] * side
+
+
+def _density(state: Stack, wi: Vector, wo: Vector) -> Array:
+    """Density of `_sample` in solid angle, 1/sr."""
+    side = jnp.where(wi[2] < 0, -1.0, 1.0)
+    local, towards = sanitise((wi[0], wi[1], wi[2] * side)), (wo[0], wo[1], wo[2] * side)
+    near, far = _diffuse_shares(state)
+    density = jnp.where(towards[2] > 0, near, far) * jnp.abs(towards[2]) / jnp.pi
+    facets = _facets(state)
+    if facets is not None:
+        h, _ = half_vector(local, towards)
+        mirrored = reflection_pdf(h, local, facets.alpha, facets.distribution)
+        density = density + (1.0 - near - far) * jnp.where(h[2] > 0, mirrored, 0.0)
+    return density
 
 
 def _diffuse_shares(state: Stack) -> tuple[float, float]:

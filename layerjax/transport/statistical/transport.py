@@ -6,6 +6,7 @@ follow from adding. Over a diffuse base the light that has reached it leaves as 
 
 import dataclasses
 from collections.abc import Sequence
+from functools import partial
 from typing import Any, Literal, get_args
 
 import equinox as eqx
@@ -40,13 +41,7 @@ from layerjax.transport.lobes.microfacet import (
     unfold,
 )
 from layerjax.transport.lobes.statistics import Options, Scattering, bound_alpha, smooth_parts
-from layerjax.transport.specular import (
-    has_specular,
-    is_smooth,
-    select_specular,
-    specular_draws,
-    specular_probability,
-)
+from layerjax.transport.specular import density_with_deltas, is_smooth, sample_with_deltas, specular_draws
 from layerjax.transport.statistical.coated_base import is_coated, make_coated
 from layerjax.transport.statistical.diffuse_base import make_diffuse
 from layerjax.transport.statistical.diffuse_lobe import make_diffuse_lobe, why_no_lobe
@@ -62,8 +57,6 @@ from layerjax.transport.statistical.streamed_base import is_streamed, make_strea
 
 INDEX_SLACK = 1e-6
 """Of the logarithm of a ratio of indices: those that are given in single precision are rounded."""
-
-BELOW_ONE = 1.0 - 1e-6
 
 LEAST_PAIRS = 8
 """Pairs of directions from which on channels are an axis of the lobes' program. Of fewer (a texel has one), processors,
@@ -191,16 +184,10 @@ class Statistical(DeterministicTransport):
         return channels.total([found, diffuse_part(state.diffuse, wi, wo)])
 
     def sample(self, state: StatisticalState, wi: Vector, uniforms: tuple[Array, Array, Array]) -> Vector:
-        if not has_specular(state.stack):
-            return self._draw(state, wi, uniforms)
-        u, u1, u2 = uniforms
-        rest = 1.0 - specular_probability(state.stack, wi)
-        others = self._draw(state, wi, (jnp.clip(safe_div(u, rest), 0.0, BELOW_ONE), u1, u2))
-        return select_specular(state.stack, wi, u, others)
+        return sample_with_deltas(state.stack, wi, uniforms, partial(self._draw, state, wi))
 
     def pdf(self, state: StatisticalState, wi: Vector, wo: Vector) -> Array:
-        density = self._density(state, wi, wo)
-        return density * (1.0 - specular_probability(state.stack, wi)) if has_specular(state.stack) else density
+        return density_with_deltas(state.stack, wi, self._density(state, wi, wo))
 
     def specular_draws(
         self, state: StatisticalState, wi: Vector, uniforms: tuple[Array, Array, Array]

@@ -145,7 +145,7 @@ def test_the_walk_agrees(name):
     solved = lj.albedo(stack, wi[:, 0])
     counted = lj.goniophotometer(stack, wi[:, 0], key=jax.random.key(1), paths=1 << 15)
     for side, energy in enumerate(solved):
-        slack = 5.0 * counted.albedo_error[:, side] + 3e-3
+        slack = 5.0 * counted.albedo_error[:, side] + 3e-3  # energies between nodes: to 4e-3 at worst
         assert np.all(np.abs(energy - counted.albedo[:, side]) <= slack)
     specular = sum(lj.specular(stack, wi[:, 0]))
     assert np.all(np.abs(specular - counted.unscattered) <= 5.0 * counted.unscattered_error + 1e-5)
@@ -241,7 +241,7 @@ def test_statistics_of_smooth_stacks_are_those_of_narrow_ones(name):
 @pytest.mark.parametrize("orders", [pytest.param("first", marks=pytest.mark.slow), "all"])
 def test_draws_of_mirrors_and_of_single_orders(orders):
     """A mirror alone has nothing but its delta; deltas are of no single order, and bias nothing."""
-    transport, count = lj.AddingDoubling(nodes=4, modes=2, orders=orders), 20_000
+    transport, count = lj.AddingDoubling(nodes=8, modes=8, orders=orders), 20_000
     for stack in (lj.Stack([], lj.Conductor(*METAL)), STACKS["varnish"], STACKS["hazy pane"]):
         wi = lj.direction(1.0, 0.2)
         weight = lj.sample(stack, jnp.broadcast_to(wi, (count, 3)), jax.random.key(0), transport)[2]
@@ -257,7 +257,9 @@ def test_draws_of_mirrors_and_of_single_orders(orders):
                 for side in sides
             )
         error = weight.std(axis=0) / np.sqrt(count)
-        assert np.all(np.abs(weight.mean(axis=0) - energy) <= 6.0 * error + 2e-2 * energy)
+        # energies between nodes: to 4e-3 at worst; that of single orders is a mean of draws itself
+        slack = 4e-3 if orders == "all" else 4.0 / np.sqrt(count)
+        assert np.all(np.abs(weight.mean(axis=0) - energy) <= 5.0 * error + slack * energy + 1e-9)
 
 
 def test_weights_of_draws_have_derivatives():
