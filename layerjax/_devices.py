@@ -38,7 +38,6 @@ def exact_products(function: Callable[P, T]) -> Callable[P, T]:
 def compile_for_devices(function: Callable[P, T]) -> Callable[P, T]:
     """The function compiled, as by `filter_jit`, with what it hands to `shard_rows` split over all of them."""
 
-    @filter_jit
     @exact_products
     def program(devices: int, *arguments: P.args, **options: P.kwargs) -> T:
         before = _device_count.set(devices)
@@ -47,11 +46,19 @@ def compile_for_devices(function: Callable[P, T]) -> Callable[P, T]:
         finally:
             _device_count.reset(before)
 
+    deterministic, random = filter_jit(program), filter_jit(program, walks=True)
+
     @wraps(function)
     def call(*arguments: P.args, **options: P.kwargs) -> T:
-        return program(_count_devices(arguments, options), *arguments, **options)
+        compiled = random if any(map(_is_random, arguments)) else deterministic
+        return compiled(_count_devices(arguments, options), *arguments, **options)
 
     return call
+
+
+def _is_random(argument: Any) -> bool:
+    """Whether it is a transport that draws, or is prepared for one."""
+    return bool(getattr(getattr(argument, "transport", argument), "random", False))
 
 
 def _count_devices(*inputs: Any) -> int:

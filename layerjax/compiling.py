@@ -27,12 +27,16 @@ LEAST_COMPILE = 0.1
 OPTIONS: dict[str, Any] = {"xla_cpu_use_fusion_emitters": False, "xla_cpu_prefer_vector_width": 512}
 """Of XLA on a CPU: kernels go to LLVM without MLIR's passes before it, in vectors as wide as the processor has."""
 
+SLOW_IN_LOOPS = frozenset({"xla_cpu_use_fusion_emitters"})
+"""Options not taken for random walks: without MLIR's passes their loops run 2.5 times slower."""
+
 
 def compiler_options() -> dict[str, Any]:
     """Options for `jax.jit` by which this library compiles in two thirds of the time, and runs 3 to 5 % slower.
 
-    They belong to one program and change nothing global. JAX takes them at the outermost `jit` only, and gradients of
-    `Statistical` over large batches run a quarter slower with them.
+    They belong to one program and change nothing global. JAX takes them at the outermost `jit` only. Gradients of
+    `Statistical` over large batches run a quarter slower with them, and `RandomWalk` takes 2.5 times as long: leave
+    them out there.
 
     Returns:
         What this version of XLA knows of them; nothing where programs do not run on a CPU.
@@ -66,13 +70,18 @@ def _is_supported(name: str, value: Any) -> bool:
     return True
 
 
-def filter_jit(function: Callable[P, T]) -> Callable[P, T]:
-    """`eqx.filter_jit` with `compiler_options` where it is the outermost: a program within another one takes none."""
+def filter_jit(function: Callable[P, T], *, walks: bool = False) -> Callable[P, T]:
+    """`eqx.filter_jit` with `compiler_options` where it is the outermost: a program within another one takes none.
+
+    walks: whether it is a random walk, for which some of the options do not pay.
+    """
     inner = eqx.filter_jit(function)
 
     @cache
     def outermost() -> Callable[P, T]:
-        settings: dict[str, Any] = {"compiler_options": compiler_options() or None}
+        omitted = SLOW_IN_LOOPS if walks else frozenset()
+        options = {name: value for name, value in compiler_options().items() if name not in omitted}
+        settings: dict[str, Any] = {"compiler_options": options or None}
         return eqx.filter_jit(function, **settings)
 
     @wraps(function)

@@ -24,7 +24,7 @@ from benchmarks.suite import coated_haze
 Floats = NDArray[np.float64]
 
 ERROR = 1e-3
-RESOLUTIONS = ((4, 4), (4, 6), (6, 6), (6, 8), (8, 8), (8, 12), (12, 16), (16, 24), (24, 32))
+RESOLUTIONS = ((4, 4), (4, 6), (5, 6), (6, 6), (6, 8), (8, 8), (8, 12), (12, 16), (16, 24), (24, 32))
 """Nodes and modes of `AddingDoubling` that are tried until one reaches the error."""
 FINEST = (48, 64)
 CALLS = 20
