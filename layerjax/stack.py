@@ -5,6 +5,7 @@ refuse concrete values outside the documented box (`layerjax.RANGES`) by name.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
+from functools import partial
 from typing import Any, cast
 
 import equinox as eqx
@@ -20,7 +21,8 @@ from layerjax._repr import ReprModule, describe
 from layerjax._shapes import channel_count
 from layerjax.channels import Channels, per_channel
 from layerjax.directions import Vector
-from layerjax.normals.facets import Distribution, check_facets
+from layerjax.normals.facets import Distribution, check_facets, width_of
+from layerjax.normals.widths import Width, azimuth_of_tangent
 from layerjax.phase import HenyeyGreenstein, PhaseFunction
 from layerjax.surfaces import Conductor, Surface
 
@@ -47,7 +49,13 @@ class Interface(ReprModule):
                                    "beckmann",                          Mises-Fisher; the last two only in `ENDF`, and
                                    "vmf"                                in `AddingDoubling` and `RandomWalk` with
                                                                         ``facet_multiple_scattering=False``
+    alpha_y             ()    1    [1e-4, 1]    None     yes            width across the tangent (alpha is that along
+                                                                        it); None: alpha. GGX and Beckmann
+    tangent             ()    rad  [-pi, pi]    0        yes            azimuth of the tangent, or a vector along it
     ============ ====== ===== ==== ============ ======== ============== ================================================
+
+    With two widths, as of a brushed surface, it is in `AddingDoubling` and `RandomWalk`, with
+    ``facet_multiple_scattering=False``.
 
     A smooth interface reflects and refracts each ray by itself: see `layerjax.specular`. It is in `AddingDoubling`,
     `RandomWalk` and `Statistical`; a width that is traced or fitted stays rough.
@@ -61,9 +69,21 @@ class Interface(ReprModule):
     ior: Parameter = parameter("Interface.ior")
     alpha: Parameter = parameter("Interface.alpha", default=None, optional=True, ranged=False, absent_at_zero=True)
     distribution: Distribution = eqx.field(static=True, default="ggx")
+    alpha_y: Parameter = parameter("Interface.alpha_y", default=None, optional=True)
+    tangent: Parameter = eqx.field(converter=partial(azimuth_of_tangent, "Interface.tangent"), default=None)
 
     def __check_init__(self) -> None:
-        check_facets("Interface", self.distribution, self.alpha)
+        check_facets("Interface", self.distribution, self.alpha, self.alpha_y, self.tangent)
+
+    @property
+    def width(self) -> Width:
+        """Of its facets: one number, or two along and across a tangent."""
+        return width_of(self.alpha, self.alpha_y, self.tangent)
+
+    @property
+    def is_anisotropic(self) -> bool:
+        """Whether it has two widths, by structure."""
+        return self.alpha_y is not None
 
     @property
     def is_smooth(self) -> bool:
@@ -219,7 +239,7 @@ def simplify_and_name(stack: Stack) -> tuple[Stack, tuple[str, ...]]:
         if isinstance(layer, Interface):
             if _are_equal(layer.ior, above):
                 continue
-            above = layer.ior
+            above, layer = layer.ior, _merge_widths(layer)
         if isinstance(layer, TurbidMedium):
             layer = _make_turbid_static(layer).as_medium()
         if isinstance(layer, Medium):
@@ -233,7 +253,16 @@ def simplify_and_name(stack: Stack) -> tuple[Stack, tuple[str, ...]]:
     base = stack.base
     if isinstance(base, Conductor) and base.film is not None and _is_everywhere(base.film.thickness_nm, 0.0):
         stack = eqx.tree_at(lambda s: s.base.film, stack, None)
+    if isinstance(base, Conductor):
+        stack = eqx.tree_at(lambda s: s.base, stack, _merge_widths(stack.base))
     return eqx.tree_at(lambda s: s.layers, stack, tuple(layers)), tuple(names)
+
+
+def _merge_widths(part: Any) -> Any:
+    """An interface or a conductor of two widths that are known to be equal, as one of a single width."""
+    if part.alpha_y is None or not _are_equal(part.alpha, part.alpha_y):
+        return part
+    return eqx.tree_at(lambda p: (p.alpha_y, p.tangent), part, (None, None), is_leaf=lambda leaf: leaf is None)
 
 
 def make_constants_static(stack: Stack) -> Stack:

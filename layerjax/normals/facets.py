@@ -1,25 +1,27 @@
 """Normals of the facets of a rough surface: GGX, Beckmann or von Mises-Fisher, behind one set of functions.
 
-Which one is known while tracing, so that none pays for another. Masking is separable Smith. GGX and Beckmann normals
-are drawn as they are seen. Seen vMF normals have no sampler in closed form: the polar angle is drawn as it is, the
-azimuth about the plane of incidence from a density linear between 0 and the rim beyond which facets look away. None is
-lost, and what is left to weigh (see `draw_weight`) is 1 where normals are narrow, with a standard deviation of 0.5 at
-grazing light and of 0.6 at kappa = 0.
+Which one is known while tracing, so that none pays for another, and so is whether facets have one width or two. Masking
+is separable Smith. GGX and Beckmann normals are drawn as they are seen. Seen vMF normals have no sampler in closed
+form: the polar angle is drawn as it is, the azimuth about the plane of incidence from a density linear between 0 and
+the rim beyond which facets look away. None is lost, and what is left to weigh (see `draw_weight`) is 1 where normals
+are narrow, with a standard deviation of 0.5 at grazing light and of 0.6 at kappa = 0.
 """
 
 from typing import Any, Literal, get_args
 
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from layerjax._checks import require_choice
 from layerjax._numerics import clamp_max, clamp_min, safe_div, safe_sqrt
 from layerjax._parameters import check_range, is_placeholder
-from layerjax.directions import Vector, dot
+from layerjax.directions import Vector, dot, normalize, reflect, sanitise, scale
 from layerjax.normals import vmf
 from layerjax.normals.beckmann import beckmann_area, beckmann_density, beckmann_sample
 from layerjax.normals.ggx import ggx_area, ggx_density, ggx_masking, ggx_sample
 from layerjax.normals.sggx import radii
+from layerjax.normals.widths import Width, Widths, from_unit_width, length, shrink, stretch, unit_grid
 from layerjax.quadrature import Nodes, flake_rule, panels
 
 Distribution = Literal["ggx", "beckmann", "vmf"]
@@ -35,15 +37,34 @@ TAIL = 4.6
 """Quadratures end where kappa (1 - cos theta) is the square of this; 6e-10 of the normals lie beyond."""
 
 
-def check_facets(owner: str, distribution: Any, alpha: Any) -> None:
-    """Refuse a distribution that is none, and a width outside the range that belongs to it; None: smooth."""
+def check_facets(owner: str, distribution: Any, alpha: Any, alpha_y: Any = None, tangent: Any = None) -> None:
+    """Refuse a distribution that is none, a width outside the range that belongs to it (None: smooth), a second width
+    that cannot be, and a tangent that is none."""
     require_choice(f"{owner}.distribution", distribution, get_args(Distribution))
     if alpha is not None and not is_placeholder(alpha):
         check_range(f"{owner}.alpha" if distribution == "ggx" else f"{owner}.alpha, {distribution}", alpha)
+    if alpha_y is None:
+        if tangent is not None:
+            raise ValueError(f"{owner}.tangent: given without alpha_y, the width across it")
+        return
+    if alpha is None:
+        raise ValueError(f"{owner}.alpha_y: given without alpha; a smooth surface has no width")
+    if distribution == "vmf":
+        raise ValueError(f'{owner}.alpha_y: "vmf" normals have one width; "ggx" and "beckmann" may have two')
 
 
-def density(m: Vector, alpha: Array, distribution: Distribution) -> Array:
+def width_of(alpha: Any, alpha_y: Any, tangent: Any) -> Any:
+    """The width or the widths of facets, by their parameters."""
+    return alpha if alpha_y is None else Widths(alpha, alpha_y, tangent)
+
+
+def density(m: Vector, alpha: Width, distribution: Distribution) -> Array:
     """Density D(m) of normals above the horizon, 1/sr; the integral of D cos over the hemisphere is 1."""
+    if isinstance(alpha, Widths):
+        v = shrink(m, alpha)
+        size = length(v)
+        unit = density(scale(1.0 / size, v), jnp.ones_like(size), distribution)
+        return unit / (size * size) / (alpha.alpha * size) / (alpha.alpha_y * size)
     if distribution == "ggx":
         return ggx_density(m, alpha)
     if distribution == "beckmann":
@@ -51,11 +72,17 @@ def density(m: Vector, alpha: Array, distribution: Distribution) -> Array:
     return vmf.hemisphere_density(m, vmf.concentration(alpha))
 
 
-def twice_projected_area(cosine: Array, w: Vector, alpha: Array, distribution: Distribution) -> Array:
+def twice_projected_area(cosine: Array, w: Vector, alpha: Width, distribution: Distribution) -> Array:
     """2 cos / G1(w): twice the projected area of the facets seen along w, which has this cosine >= 0 with the normal.
 
     Densities of light that a facet scatters are quotients by it, so that no cosine is left to divide by.
     """
+    if isinstance(alpha, Widths):
+        # an area goes with the length of the vector along which it is seen
+        v = stretch(w, alpha)
+        if distribution == "ggx":
+            return cosine + length(v)
+        return twice_projected_area(cosine, v, jnp.ones_like(cosine), distribution)
     if distribution == "ggx":
         return cosine + ggx_area(w, alpha)
     if distribution == "beckmann":
@@ -63,13 +90,16 @@ def twice_projected_area(cosine: Array, w: Vector, alpha: Array, distribution: D
     return 2.0 / vmf.masking_over_cosine(cosine, vmf.concentration(alpha))
 
 
-def masking(w: Vector, alpha: Array, distribution: Distribution) -> Array:
+def masking(w: Vector, alpha: Width, distribution: Distribution) -> Array:
     """Smith masking G1(w) for w above the horizon."""
     return 2.0 * w[2] / twice_projected_area(w[2], w, alpha, distribution)
 
 
-def sample(wi: Vector, alpha: Array, u1: Array, u2: Array, distribution: Distribution) -> Vector:
+def sample(wi: Vector, alpha: Width, u1: Array, u2: Array, distribution: Distribution) -> Vector:
     """A normal that is seen from wi (above the horizon), from two uniform numbers; see `reflection_pdf`."""
+    if isinstance(alpha, Widths):
+        unit = sample(normalize(stretch(wi, alpha)), jnp.ones_like(wi[2]), u1, u2, distribution)
+        return from_unit_width(unit, alpha)
     if distribution == "ggx":
         return ggx_sample(wi, alpha, u1, u2)
     if distribution == "beckmann":
@@ -85,8 +115,10 @@ def sample(wi: Vector, alpha: Array, u1: Array, u2: Array, distribution: Distrib
     return x * along - y * across, y * along + x * across, cosine
 
 
-def reflection_pdf(h: Vector, wi: Vector, alpha: Array, distribution: Distribution = "ggx") -> Array:
+def reflection_pdf(h: Vector, wi: Vector, alpha: Width, distribution: Distribution = "ggx") -> Array:
     """Density, 1/sr, of directions mirrored at facets that `sample` draws, by their half vector with wi."""
+    if isinstance(alpha, Widths):
+        return density(h, alpha, distribution) / (2.0 * twice_projected_area(wi[2], wi, alpha, distribution))
     if distribution == "ggx":
         return ggx_density(h, alpha) * ggx_masking(wi, alpha) / (4.0 * wi[2])
     if distribution == "beckmann":
@@ -106,12 +138,35 @@ def draw_weight(wi: Vector, m: Vector, alpha: Array) -> Array:
     return clamp_min(seen / (vmf.hemisphere_norm(kappa) * _share_drawn(wi, m, kappa)), LEAST_WEIGHT)
 
 
-def rule(wi: Vector, alpha: Array, nodes: int, distribution: Distribution) -> Nodes:
+def rule(wi: Vector, alpha: Width, nodes: int, distribution: Distribution) -> Nodes:
     """Quadrature over the directions above the horizon that the facets mirror wi to (see `layerjax.quadrature`)."""
+    if isinstance(alpha, Widths):
+        return _drawn_rule(wi, alpha, nodes, distribution)
     if distribution == "ggx":
         return flake_rule(wi, *radii("surface", alpha), None, nodes)[0]
     # Beckmann normals end where vMF normals as wide do, or before
     return _mirror_rule(wi, vmf.concentration(alpha), nodes)
+
+
+def visible_grid(
+    wi: Vector, alpha: Widths, distribution: Distribution, points: tuple[int, int]
+) -> tuple[Vector, np.ndarray]:
+    """Normals seen along wi, a new last axis, and their shares of the visible area: a grid of what draws them."""
+    *uniforms, weight = unit_grid(*points, round_axis=distribution == "ggx")
+    u1, u2 = (jnp.asarray(u, wi[2].dtype) for u in uniforms)
+    x, y, z = (jnp.broadcast_to(part[..., None], (*wi[2].shape, u1.size)) for part in wi)
+    return sample((x, y, z), alpha, u1, u2, distribution), weight
+
+
+def _drawn_rule(wi: Vector, alpha: Widths, nodes: int, distribution: Distribution) -> Nodes:
+    """Directions that the facets mirror wi to, each with one over its density as it is drawn."""
+    m, share = visible_grid(wi, alpha, distribution, (nodes, 2 * nodes))
+    towards = (wi[0][..., None], wi[1][..., None], wi[2][..., None])
+    wo = reflect(towards, m)
+    above = wo[2] > 0
+    drawn = reflection_pdf(m, towards, alpha, distribution)
+    weight = jnp.where(above & (drawn > 0), jnp.asarray(share, drawn.dtype) / jnp.where(drawn > 0, drawn, 1.0), 0.0)
+    return sanitise(wo, above), weight
 
 
 def _plane(wi: Vector) -> tuple[Array, Array, Array]:

@@ -11,10 +11,11 @@ from layerjax import fresnel
 from layerjax.directions import Vector, add, combine, dot, half_vector, normalize, reflect, refract, scale, select
 from layerjax.normals import facets
 from layerjax.normals.facets import Distribution
+from layerjax.normals.widths import Width, Widths
 from layerjax.surfaces.microfacet import mirror_lobe, visibility
 
 
-def interface_reflection(wi: Vector, wo: Vector, ior: Array, alpha: Array, distribution: Distribution = "ggx") -> Array:
+def interface_reflection(wi: Vector, wo: Vector, ior: Array, alpha: Width, distribution: Distribution = "ggx") -> Array:
     """BRDF of a rough dielectric interface, 1/sr, without the cosine (Walter 2007, Eq. 20).
 
     Args:
@@ -28,7 +29,7 @@ def interface_reflection(wi: Vector, wo: Vector, ior: Array, alpha: Array, distr
 
 
 def interface_transmission(
-    wi: Vector, wo: Vector, ior: Array, alpha: Array, distribution: Distribution = "ggx"
+    wi: Vector, wo: Vector, ior: Array, alpha: Width, distribution: Distribution = "ggx"
 ) -> Array:
     """BTDF of a rough dielectric interface, 1/sr, without the cosine (Walter 2007, Eq. 21, with its eta_o^2).
 
@@ -45,7 +46,7 @@ def interface_transmission(
 
 
 def continued_transmission(
-    wi: Vector, wo: Vector, ior: Array, alpha: Array, distribution: Distribution
+    wi: Vector, wo: Vector, ior: Array, alpha: Width, distribution: Distribution
 ) -> tuple[Array, Array]:
     """`interface_transmission` with facets that face down as well, and their height: see `continued_lobe`."""
     lobe, transmitted, height = continued_lobe(wi, wo, ior, alpha, distribution)
@@ -53,7 +54,7 @@ def continued_transmission(
 
 
 def refraction_lobe(
-    wi: Vector, wo: Vector, ior: Array, alpha: Array, distribution: Distribution = "ggx"
+    wi: Vector, wo: Vector, ior: Array, alpha: Width, distribution: Distribution = "ggx"
 ) -> tuple[Array, Array]:
     """Facets that refract wi to wo: D <wi, m> <wo, m> ior^2 / (<wi, m> + ior <wo, m>)^2, and their transmittance 1 - F.
 
@@ -64,7 +65,7 @@ def refraction_lobe(
 
 
 def continued_lobe(
-    wi: Vector, wo: Vector, ior: Array, alpha: Array, distribution: Distribution
+    wi: Vector, wo: Vector, ior: Array, alpha: Width, distribution: Distribution
 ) -> tuple[Array, Array, Array]:
     """`refraction_lobe` with facets that face down as well, D being even; and z of wi + ior wo, signed as the normal's.
 
@@ -82,7 +83,7 @@ def continued_lobe(
     x, y, z = jnp.where(exists, v[0], 0.0), jnp.where(exists, v[1], 0.0), jnp.where(exists, v[2], 1.0)
     # 1 - F with both cosines known: no difference, and no angle of total reflection
     transmitted = 2.0 * ior * a * b * (1.0 / (a + ior * b) ** 2 + 1.0 / (ior * a + b) ** 2)
-    if distribution == "ggx":
+    if distribution == "ggx" and not isinstance(alpha, Widths):
         q = x * x + y * y + (alpha * z) ** 2
         lobe = (ior * alpha * a / q) * (ior * alpha * b / q) / jnp.pi
     else:
@@ -98,7 +99,7 @@ def is_index_matched(ior: Array) -> Array:
 
 
 def interface_sample(
-    wi: Vector, ior: Array, alpha: Array, u1: Array, u2: Array, u3: Array, distribution: Distribution = "ggx"
+    wi: Vector, ior: Array, alpha: Width, u1: Array, u2: Array, u3: Array, distribution: Distribution = "ggx"
 ) -> tuple[Vector, Array]:
     """Direction that a facet seen from wi reflects or refracts to, chosen by its Fresnel reflectance.
 
@@ -110,7 +111,7 @@ def interface_sample(
 
 
 def interface_event(
-    wi: Vector, ior: Array, alpha: Array, u1: Array, u2: Array, u3: Array, distribution: Distribution
+    wi: Vector, ior: Array, alpha: Width, u1: Array, u2: Array, u3: Array, distribution: Distribution
 ) -> tuple[Vector, Array, Vector]:
     """`interface_sample`, with the normal of the facet."""
     m = facets.sample(wi, alpha, u1, u2, distribution)
@@ -121,12 +122,13 @@ def interface_event(
 
 
 def interface_pdf(
-    f: Array, wi: Vector, wo: Vector, ior: Array, alpha: Array, distribution: Distribution = "ggx"
+    f: Array, wi: Vector, wo: Vector, ior: Array, alpha: Width, distribution: Distribution = "ggx"
 ) -> Array:
     """Density of `interface_sample`, 1/sr, from the BSDF f of the pair: f |cos_o| / G1(wo), less what draws weigh."""
     density = 0.5 * f * facets.twice_projected_area(jnp.abs(wo[2]), wo, alpha, distribution)
     if distribution != "vmf":
         return density
+    assert not isinstance(alpha, Widths)
     return density / facets.draw_weight(wi, facet_normal(wi, wo, ior), alpha)
 
 

@@ -1,5 +1,6 @@
 """Conductors: mirrors, and rough ones of microfacets with separable Smith masking (Walter et al. 2007)."""
 
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -12,7 +13,8 @@ from layerjax._parameters import Parameter, parameter
 from layerjax.channels import Channels, map_channels, per_channel
 from layerjax.directions import Vector, half_vector, mirror, reflect
 from layerjax.normals import facets
-from layerjax.normals.facets import Distribution, check_facets, reflection_pdf
+from layerjax.normals.facets import Distribution, check_facets, reflection_pdf, width_of
+from layerjax.normals.widths import Width, azimuth_of_tangent
 from layerjax.quadrature import Nodes
 from layerjax.surfaces.contract import Surface
 from layerjax.surfaces.thin_film import ThinFilm
@@ -38,6 +40,9 @@ class Conductor(Surface):
                                       "vmf"
     film                              `ThinFilm`   None     yes            transparent film on every facet; not in
                                                                            `Statistical` and `ENDF`
+    alpha_y             ()       1    [1e-4, 1]    None     yes            width across the tangent (alpha is that along
+                                                                           it), as of brushed metal; None: alpha
+    tangent             ()       rad  [-pi, pi]    0        yes            azimuth of the tangent, or a vector along it
     ============ ====== ======== ==== ============ ======== ============== =============================================
     """
 
@@ -46,15 +51,27 @@ class Conductor(Surface):
     alpha: Parameter = parameter("Conductor.alpha", default=None, optional=True, ranged=False, absent_at_zero=True)
     distribution: Distribution = eqx.field(static=True, default="ggx")
     film: ThinFilm | None = None
+    alpha_y: Parameter = parameter("Conductor.alpha_y", default=None, optional=True)
+    tangent: Parameter = eqx.field(converter=partial(azimuth_of_tangent, "Conductor.tangent"), default=None)
 
     def __check_init__(self) -> None:
-        check_facets("Conductor", self.distribution, self.alpha)
+        check_facets("Conductor", self.distribution, self.alpha, self.alpha_y, self.tangent)
         require_kind("Conductor.film", self.film, ThinFilm, None)
 
     @property
     def is_smooth(self) -> bool:
         """Whether it is a mirror, by structure: then all that it reflects is a delta."""
         return self.alpha is None
+
+    @property
+    def width(self) -> Width:
+        """Of its facets: one number, or two along and across a tangent."""
+        return width_of(self.alpha, self.alpha_y, self.tangent)
+
+    @property
+    def is_anisotropic(self) -> bool:
+        """Whether it has two widths, by structure."""
+        return self.alpha_y is not None
 
     def reflectance(self, cosine: Array) -> Channels:
         """Fresnel reflectance of a facet, by the cosine of incidence on it."""
@@ -76,33 +93,33 @@ class Conductor(Surface):
         if self.is_smooth:
             return (jnp.zeros_like(wi[2] * wo[2]),)
         h, cosine = half_vector(wi, wo, same_side=True)
-        lobe = mirror_lobe(h, wi, wo, self.alpha, self.distribution)
+        lobe = mirror_lobe(h, wi, wo, self.width, self.distribution)
         return tuple(lobe * level for level in self.reflectance(cosine))
 
     def sample(self, wi: Vector, u1: Array, u2: Array) -> Vector:
         if self.is_smooth:
             return mirror(wi)
-        return reflect(wi, facets.sample(wi, self.alpha, u1, u2, self.distribution))
+        return reflect(wi, facets.sample(wi, self.width, u1, u2, self.distribution))
 
     def pdf(self, wi: Vector, wo: Vector) -> Array:
         if self.is_smooth:
             return jnp.zeros_like(wi[2] * wo[2])
         h, _ = half_vector(wi, wo, same_side=True)
-        return reflection_pdf(h, wi, self.alpha, self.distribution)
+        return reflection_pdf(h, wi, self.width, self.distribution)
 
     def rule(self, wi: Vector, nodes: int) -> Nodes:
         if self.is_smooth:
             return super().rule(wi, nodes)
-        return facets.rule(wi, self.alpha, nodes, self.distribution)
+        return facets.rule(wi, self.width, nodes, self.distribution)
 
 
-def mirror_lobe(h: Vector, wi: Vector, wo: Vector, alpha: Array, distribution: Distribution) -> Array:
+def mirror_lobe(h: Vector, wi: Vector, wo: Vector, alpha: Width, distribution: Distribution) -> Array:
     """BRDF of facets that are perfect mirrors, D G / (4 cos cos), 1/sr."""
     return facets.density(h, alpha, distribution) * visibility(wi[2], wi, wo[2], wo, alpha, distribution)
 
 
 def visibility(
-    cosine_i: Array, wi: Vector, cosine_o: Array, wo: Vector, alpha: Array, distribution: Distribution
+    cosine_i: Array, wi: Vector, cosine_o: Array, wo: Vector, alpha: Width, distribution: Distribution
 ) -> Array:
     """G1(i) G1(o) / (4 cos cos) of two directions and their cosines, >= 0; no cosine is left to divide by."""
     seen_i = facets.twice_projected_area(cosine_i, wi, alpha, distribution)

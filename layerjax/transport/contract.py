@@ -309,8 +309,20 @@ def refuse_smooth(stack: Stack, names: Sequence[str], transport: str) -> None:
             )
 
 
+def refuse_anisotropic(stack: Stack, names: Sequence[str], transport: str) -> None:
+    """Raise a ValueError that names the first facets of two widths, on behalf of a transport without them."""
+    for name, part in [*zip(names, stack.layers, strict=True), ("base", stack.base)]:
+        if isinstance(part, Interface | Conductor) and part.is_anisotropic:
+            raise ValueError(
+                f"{name}.alpha_y: {transport} carries no facets of two widths; AddingDoubling and RandomWalk with "
+                "facet_multiple_scattering=False do, and of a bare or hazy metal SingleScattering and SpongeCake"
+            )
+
+
 def require_ggx(stack: Stack, names: Sequence[str], transport: str) -> None:
-    """Raise a ValueError that names the first facets that are not GGX, on behalf of a transport without others."""
+    """Raise a ValueError that names the first facets that are not GGX of one width, on behalf of a transport without
+    others."""
+    refuse_anisotropic(stack, names, transport)
     for name, part in [*zip(names, stack.layers, strict=True), ("base", stack.base)]:
         if isinstance(part, Interface | Conductor) and part.distribution != "ggx":
             raise ValueError(

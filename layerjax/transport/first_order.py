@@ -20,6 +20,7 @@ from layerjax._parameters import Parameter
 from layerjax.channels import Channels, map_channels, multiply, total
 from layerjax.directions import Vector, flip, half_vector, reflect, sanitise, select
 from layerjax.normals.facets import Distribution, reflection_pdf, rule, sample
+from layerjax.normals.widths import Width
 from layerjax.quadrature import Nodes
 from layerjax.stack import Interface, Medium, Stack, optical_depths
 from layerjax.surfaces import Conductor, Surface
@@ -33,7 +34,7 @@ class ReflectingInterface(Surface):
     """Reflection at an interface, seen from its upper side. ior: index below over index above."""
 
     ior: Parameter
-    alpha: Parameter
+    alpha: Width
     distribution: Distribution = eqx.field(static=True, default="ggx")
 
     def evaluate(self, wi: Vector, wo: Vector) -> tuple[Array, ...]:
@@ -135,7 +136,7 @@ def _rough_order(stack: Stack) -> FirstOrder:
     first, last = interfaces[0], interfaces[-1]
     face = stack.layers[first]
     assert isinstance(face, Interface)
-    upper = Media(_media(stack.layers[:first]), ReflectingInterface(face.ior, face.alpha, face.distribution))
+    upper = Media(_media(stack.layers[:first]), ReflectingInterface(face.ior, face.width, face.distribution))
     if stack.base is not None:
         return FirstOrder(upper, None, None, True, True)
     above: Any = 1.0
@@ -147,9 +148,9 @@ def _rough_order(stack: Stack) -> FirstOrder:
     assert isinstance(bottom, Interface)
     lower = Media(
         tuple(map(_flip_medium, reversed(_media(stack.layers[last + 1 :])))),
-        ReflectingInterface(above / bottom.ior, bottom.alpha, bottom.distribution),
+        ReflectingInterface(above / bottom.ior, bottom.width, bottom.distribution),
     )
-    crossing = ReflectingInterface(face.ior, face.alpha, face.distribution) if first == last else None
+    crossing = ReflectingInterface(face.ior, face.width, face.distribution) if first == last else None
     return FirstOrder(upper, lower, crossing, False, True)
 
 

@@ -31,7 +31,7 @@ from layerjax.transport.adding_doubling.operators import (
     scale_rows,
 )
 from layerjax.transport.adding_doubling.requested_directions import requested_region, turn
-from layerjax.transport.adding_doubling.resolution import is_tilted
+from layerjax.transport.adding_doubling.resolution import has_tilted
 from layerjax.transport.specular import is_smooth
 
 POINTS = (16, 12)
@@ -77,7 +77,7 @@ def ballistic_paths(stack: Stack) -> Ballistic | None:
 
 
 def _faces(stack: Stack) -> tuple[int, int] | None:
-    if any(map(is_tilted, stack.layers)):  # what they pass goes with the azimuth
+    if has_tilted(stack):  # what they pass goes with the azimuth
         return None
     if any(map(is_smooth, stack.layers)):  # it is bent on its way
         return None

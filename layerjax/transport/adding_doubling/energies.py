@@ -14,8 +14,10 @@ from jax import Array
 
 from layerjax._numerics import clamp_max, clamp_min, clamp_nonnegative, horizon
 from layerjax.channels import Channels, map_channels, multiply, select, total
-from layerjax.directions import Vector, flip
+from layerjax.directions import Vector, flip, sanitise
+from layerjax.normals.widths import Widths
 from layerjax.stack import Interface, Stack
+from layerjax.transport.adding_doubling.anisotropic import refracted_energy
 from layerjax.transport.adding_doubling.facet_scattering import Normals, refracted_rays
 from layerjax.transport.adding_doubling.operators import Layer, Operator, Parts
 from layerjax.transport.adding_doubling.requested_directions import requested_region
@@ -127,9 +129,13 @@ def _masking_loss(media: Media, w: Vector, reflected: Array, nodes: int) -> Arra
     if media.media or not isinstance(face, ReflectingInterface):
         return jnp.zeros_like(w[2])
     above = w[2] > horizon(w[2].dtype)
-    region = requested_region(jnp.where(above, w[2], 0.5).ravel(), jnp.ones_like(face.ior))
-    _, passed = refracted_rays(region, face.ior, Normals(face.alpha, face.distribution), (nodes, max(2, nodes // 2)))
-    refracted = jnp.sum(passed, axis=-1).reshape(w[2].shape)
+    normals = Normals(face.alpha, face.distribution)
+    if isinstance(face.alpha, Widths):
+        refracted = refracted_energy(sanitise(w, above), face.ior, normals, (nodes, 2 * nodes))
+    else:
+        region = requested_region(jnp.where(above, w[2], 0.5).ravel(), jnp.ones_like(face.ior))
+        _, passed = refracted_rays(region, face.ior, normals, (nodes, max(2, nodes // 2)))
+        refracted = jnp.sum(passed, axis=-1).reshape(w[2].shape)
     return jnp.where(above, clamp_min(1.0 - reflected - refracted, 0.0), 0.0)
 
 

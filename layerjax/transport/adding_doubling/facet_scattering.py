@@ -17,6 +17,7 @@ from layerjax._numerics import clamp_max, clamp_min, safe_sqrt
 from layerjax.directions import Vector, combine, dot, normalize, reflect, sanitise
 from layerjax.normals import facets
 from layerjax.normals.facet_rule import FacetEvent, Parallels, parallels, polar_angles, visible_normals
+from layerjax.normals.widths import Width, Widths, narrowest
 from layerjax.quadrature import gauss_legendre
 from layerjax.transport.adding_doubling.grid import Grid, Region
 
@@ -34,7 +35,7 @@ CRITICAL = 7.5
 class Normals(NamedTuple):
     """Normals of an interface or a base."""
 
-    alpha: Array
+    alpha: Width
     distribution: facets.Distribution
 
 
@@ -59,7 +60,7 @@ def refracted_rays(region: Region, ratio: Array, normals: Normals, points: tuple
     """Of light from every node: where facets refract it to, and how much."""
 
     def rays(m: Vector, facing: Array, weight: Array, wi: Vector) -> tuple[Vector, Array]:
-        return _refract(wi, m, facing, weight, ratio, normals)
+        return refract(wi, m, facing, weight, ratio, normals)
 
     return map_visible_normals(rays, region, normals, ratio, "refracted", points)
 
@@ -73,6 +74,7 @@ def map_visible_normals(
     points: tuple[int, int],
 ) -> Any:
     """function(m, m . wi, weights, wi) of the normals seen from the nodes, (nodes, points); see `visible_normals`."""
+    assert not isinstance(normals.alpha, Widths)
     alpha, kind = jnp.asarray(normals.alpha, region.cosine.dtype), normals.distribution
 
     def of_nodes(rows: tuple[Array, ...]) -> Any:
@@ -86,7 +88,7 @@ def map_visible_normals(
     return map_row_chunks(of_nodes, (region.cosine, region.sine, *circles))
 
 
-def _refract(
+def refract(
     wi: Vector, m: Vector, facing: Array, weight: Array, ratio: Array, normals: Normals, blur: Array | None = None
 ) -> tuple[Vector, Array]:
     """Where facets refract light to, z counted on the far side, and how much: nothing under total reflection.
@@ -113,17 +115,18 @@ def dense_refracted_rays(grid: Grid, near: Region, far: Region, normals: Normals
     if normals.distribution != "ggx":
         # about the direction, not the normal: what a mirror sends back through them asks for more than their own caps
         return refracted_rays(near, ratio, normals, (3 * polar_count(grid) // 2, 3 * azimuth_count(grid, modes) // 2))
+    assert not isinstance(normals.alpha, Widths)
     m, weight, wi = _ggx_normals(grid, near, normals.alpha, modes)
     # the squared cosine of refraction changes by so much with the angle at the facet where it is 0
     steepness = 2.0 * safe_sqrt((1.0 - ratio) * (1.0 + ratio)) / ratio
-    return _refract(
+    return refract(
         wi, m, dot(wi, m), weight, ratio, normals, CRITICAL * facet_spacing(polar_count(grid), normals) * steepness
     )
 
 
 def facet_spacing(points: int, normals: Normals) -> Array:
     """Angle between facets of so many points from pole to rim, about."""
-    alpha = jnp.asarray(normals.alpha)
+    alpha = narrowest(normals.alpha)
     return alpha / (1.0 + 2.0 * alpha) / points
 
 

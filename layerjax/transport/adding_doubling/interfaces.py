@@ -19,6 +19,7 @@ from layerjax._batching import map_row_chunks
 from layerjax._numerics import clamp_max, clamp_min, safe_div, safe_sqrt
 from layerjax.directions import Vector, half_vector
 from layerjax.microsurface.directional_albedo import interface_energies
+from layerjax.normals.widths import narrowest
 from layerjax.surfaces.microfacet import mirror_lobe
 from layerjax.transport.adding_doubling.facet_scattering import (
     Normals,
@@ -151,25 +152,28 @@ def _operators(
     """
     outside, down, lost_outside = facet_energies(near, far, normals)
     inside, up, lost_inside = facet_energies(far, near, normals)
-    unsampled_share = _unsampled_share(grid, normals)
+    share = unsampled_share(grid, normals)
     through = _deposit(
-        grid, *dense_refracted_rays(grid, near, far, normals, modes), far, near, modes, _blur(grid, near, far, normals)
+        grid,
+        *dense_refracted_rays(grid, near, far, normals, modes),
+        far,
+        near,
+        modes,
+        blur_of_edges(grid, near, far, normals),
     )
-    through = _balance_flux(through, near, far, *_reconcile_energies(near, far, (down, up), (outside, inside)))
+    through = balance_flux(through, near, far, *reconcile_energies(near, far, (down, up), (outside, inside)))
     leaving = jnp.where(np.arange(near.weight.size) < requested, 1.0, near.weight)
     outer = None
     if not requested:
         rest = jnp.where(near.weight > 0, down - jnp.sum(through[0], axis=-2), 0.0)
-        outer = _reflection(near, outside, rest, unsampled_share, far.ior / near.ior, normals, modes)
+        outer = _reflection(near, outside, rest, share, far.ior / near.ior, normals, modes)
     rest = jnp.where(far.weight > 0, up - safe_div(through[0] @ near.weight, far.weight), 0.0)
-    inner = _reflection(
-        far, inside, rest, unsampled_share, near.ior / far.ior, normals, modes, _trapped_blur(grid, next_event)
-    )
-    once: list[Array | None] = [outer, through, _adjoint(through, leaving, far), inner]
+    inner = _reflection(far, inside, rest, share, near.ior / far.ior, normals, modes, _trapped_blur(grid, next_event))
+    once: list[Array | None] = [outer, through, adjoint(through, leaving, far), inner]
     compensation: list[Array | None] = [None] * 4
     if multiple:
         reflected = [
-            _multiple_reflected_energy(a, b.ior / a.ior, normals.alpha, level, lost)
+            _multiple_reflected_energy(a, b.ior / a.ior, narrowest(normals.alpha), level, lost)
             for a, b, level, lost in ((near, far, outside, lost_outside), (far, near, inside, lost_inside))
         ]
         gains = _energy_compensation(
@@ -198,24 +202,25 @@ def _requested_operators(
         rays = refracted_rays(requested, ratio, normals, points)
     else:
         rays = dense_refracted_rays(grid, requested, inner, normals, modes)
-    through = _deposit(grid, *rays, inner, requested, modes, _blur(grid, requested, inner, normals))
+    through = _deposit(grid, *rays, inner, requested, modes, blur_of_edges(grid, requested, inner, normals))
     inside = reflected_energy(inner, 1.0 / ratio, normals)
-    back = _adjoint(through, jnp.ones_like(requested.weight), inner)
+    back = adjoint(through, jnp.ones_like(requested.weight), inner)
     face = _face(inner, inside, 1.0 / ratio, normals, modes, _trapped_blur(grid, next_event))
     return [Parts(operator) for operator in (None, through, back, face)]
 
 
-def _unsampled_share(grid: Grid, normals: Normals) -> Array:
-    return 1.0 / (1.0 + (jnp.asarray(normals.alpha) * grid.nodes / HALF_RESOLVED_WIDTH) ** 4)
+def unsampled_share(grid: Grid, normals: Normals) -> Array:
+    """Of the light that an interface lets pass: how much of it nodes do not resolve."""
+    return 1.0 / (1.0 + (narrowest(normals.alpha) * grid.nodes / HALF_RESOLVED_WIDTH) ** 4)
 
 
-def _blur(grid: Grid, near: Region, far: Region, normals: Normals) -> Array:
+def blur_of_edges(grid: Grid, near: Region, far: Region, normals: Normals) -> Array:
     """See `interpolation_weights`: none where nodes do not resolve the lobe, for refraction sends them to nodes there.
 
     Between several interfaces no wider than rays are apart: light that is kept there by total reflection meets the edge
     again and again. As wide as for a single one, a clear slab of index 1.2 and alpha 0.5 would be off by 4e-3.
     """
-    apart = facet_spacing(polar_count(grid), normals) * (1.0 - _unsampled_share(grid, normals))
+    apart = facet_spacing(polar_count(grid), normals) * (1.0 - unsampled_share(grid, normals))
     if grid.interfaces == 1:
         return BLUR * apart * jnp.ones_like(grid.edges)
     steepness = 2.0 * safe_sqrt(grid.edges * (far.ior * far.ior - grid.edges))
@@ -256,7 +261,7 @@ def _critical_blur(wi: Vector, wo: Vector, ior: Array, azimuth: float, polar: fl
     return jnp.sqrt(squared) / (2.0 * ior * ior)
 
 
-def _adjoint(flux: Array, leaving: Array, far: Region) -> Array:
+def adjoint(flux: Array, leaving: Array, far: Region) -> Array:
     """The operator for the opposite way, by reciprocity: kernels F / W are transposes of each other."""
     kernel = safe_div(flux, jnp.broadcast_to(far.weight[:, None], flux.shape))
     return leaving[:, None] * jnp.swapaxes(kernel, -1, -2)
@@ -287,7 +292,7 @@ def _deposit(grid: Grid, wo: Vector, share: Array, far: Region, near: Region, mo
     return jnp.where(far.weight[:, None] > 0, flux, 0.0)
 
 
-def _balance_flux(flux: Array, near: Region, far: Region, down: Array, up: Array) -> Array:
+def balance_flux(flux: Array, near: Region, far: Region, down: Array, up: Array) -> Array:
     """Deposited flux F, changed least so that it passes the energy `down` of light from near nodes, and its adjoint
     `up` from far ones.
 
@@ -314,19 +319,19 @@ def _balance_flux(flux: Array, near: Region, far: Region, down: Array, up: Array
     return flux * (1.0 + sign * (of_nodes + b))
 
 
-def _reconcile_energies(
+def reconcile_energies(
     near: Region, far: Region, energies: tuple[Array, Array], reflected: tuple[Array, Array]
 ) -> tuple[Array, Array]:
     """Energies that pass both ways, made equal in total: the rest counts as reflected, where much is."""
     down, up = energies
     rest = up @ far.weight - down @ near.weight
-    most = [_largest_correction(level) for level in reflected]
+    most = [largest_correction(level) for level in reflected]
     whole = most[0] @ near.weight + most[1] @ far.weight
     step = safe_div(rest, clamp_min(whole, jnp.abs(rest)))
     return down + step * most[0], up - step * most[1]
 
 
-def _largest_correction(level: Array) -> Array:
+def largest_correction(level: Array) -> Array:
     """By how much what is reflected may be changed: a weak reflection by a small share alone."""
     return level * clamp_max(STRONG * level, 1.0)
 
@@ -335,7 +340,7 @@ def _reflection(
     region: Region,
     level: Array,
     rest: Array,
-    unsampled_share: Array,
+    share: Array,
     ior: Array,
     normals: Normals,
     modes: int,
@@ -346,10 +351,10 @@ def _reflection(
     Of an interface that they do not resolve it is reflected like by a mirror, else with the lobe: a weak one is left as
     it is, and may change by a larger share the stronger it is.
     """
-    most = _largest_correction(level)
-    resolved = (1.0 - unsampled_share) * clamp_max(clamp_min(rest, -most), most)
+    most = largest_correction(level)
+    resolved = (1.0 - share) * clamp_max(clamp_min(rest, -most), most)
     lobe = _face(region, level + resolved, ior, normals, modes, trapped_blur)
-    return lobe + unsampled_share * jnp.diag(clamp_min(rest, -level))
+    return lobe + share * jnp.diag(clamp_min(rest, -level))
 
 
 def _multiple_reflected_energy(region: Region, ratio: Array, alpha: Array, once: Array, lost: Array) -> Array:

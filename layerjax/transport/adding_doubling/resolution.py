@@ -146,7 +146,7 @@ def shortage(stack: Stack, directions_known: bool) -> str | None:
         _requirement(stack, directions_known, assumed=1.0),
         choose_resolution(stack, directions_known),
     )
-    if any(map(is_tilted, stack.layers)):
+    if has_tilted(stack):
         if cosines <= SHORT * found.ordinates[0]:
             return None
         return f"{found.ordinates[0]} x {found.ordinates[1]} ordinates, where about {cosines:.0f} cosines are needed"
@@ -206,12 +206,12 @@ def _lobes(stack: Stack, assumed: float) -> Iterator[tuple[float, float | None]]
     for layer in stack.layers:
         if isinstance(layer, Interface):
             if within and not layer.is_smooth:  # what is behind another interface is seen by reflection
-                yield _least(layer.alpha, assumed), index
+                yield _least_width(layer, assumed), index
             index, within = max(1.0, _least(layer.ior, ASSUMED_INDEX)), True
         elif not is_known(layer.albedo, 0.0):
             yield _least(layer.phase.width, assumed), index
     if isinstance(stack.base, Conductor) and stack.layers and not stack.base.is_smooth:
-        yield _least(stack.base.alpha, assumed), index
+        yield _least_width(stack.base, assumed), index
 
 
 def _peak_nodes(stack: Stack, assumed: float) -> Iterator[float]:
@@ -223,7 +223,7 @@ def _peak_nodes(stack: Stack, assumed: float) -> Iterator[float]:
             below = concrete_values(layer.ior)
             if below is not None:  # of what is not known nothing is widened
                 bent = abs(1.0 - index / float(np.min(below)))
-                width = 0.0 if layer.is_smooth else _least(layer.alpha, assumed)
+                width = 0.0 if layer.is_smooth else _least_width(layer, assumed)
                 blur, index = math.hypot(blur, BLUR * bent * width), float(np.min(below))
             within = True
         elif not is_known(layer.albedo, 0.0):
@@ -253,7 +253,7 @@ def _refracted_lobes(stack: Stack, assumed: float) -> Iterator[tuple[float, floa
     faces = [layer for layer in stack.layers if isinstance(layer, Interface)]
     smooth = [face.is_smooth for face in faces]
     mirror = isinstance(stack.base, Conductor) and stack.base.is_smooth
-    in_closed_form = len(faces) == 2 and not any(map(is_tilted, stack.layers))
+    in_closed_form = len(faces) == 2 and not has_tilted(stack)
     if not (any(smooth) or mirror) and (stack.base is not None or len(faces) < 2 or in_closed_form):
         return
     indices = [1.0, *(_least(face.ior, ASSUMED_INDEX) for face in faces)]
@@ -264,11 +264,17 @@ def _refracted_lobes(stack: Stack, assumed: float) -> Iterator[tuple[float, floa
             between = stack.base is None and 0 < here < len(faces)  # between two of them
             if face.is_smooth or not (between or any(beyond)):
                 continue
-            width = _least(face.alpha, assumed) * abs(1.0 - indices[there] / indices[here])
+            width = _least_width(face, assumed) * abs(1.0 - indices[there] / indices[here])
             if not (known[here] and known[there]):
                 yield assumed, max(1.0, indices[here])
             elif width > 0.0:  # none is deflected at equal indices
                 yield width, max(1.0, indices[here])
+
+
+def _least_width(part: Interface | Conductor, assumed: float) -> float:
+    """Of facets."""
+    least = _least(part.alpha, assumed)
+    return least if part.alpha_y is None else min(least, _least(part.alpha_y, assumed))
 
 
 def _least(value: Any, assumed: float) -> float:
@@ -278,11 +284,19 @@ def _least(value: Any, assumed: float) -> float:
 
 def resolutions(stack: Stack) -> Iterator[Resolution]:
     """All resolutions, from coarse to fine, of the kind that the stack is solved at."""
-    tilted = any(map(is_tilted, stack.layers))
+    tilted = has_tilted(stack)
     for step in ORDINATES if tilted else RESOLUTIONS:
         yield Resolution(*RESOLUTIONS[0], step) if tilted else Resolution(*step, ORDINATES[0])
 
 
-def is_tilted(layer: Any) -> bool:
-    """Whether the layer is a medium that is not symmetric about the normal (as far as is known while tracing)."""
-    return isinstance(layer, Medium | TurbidMedium) and not layer.phase.is_axisymmetric
+def is_tilted(part: Any) -> bool:
+    """Whether a layer or a base is not symmetric about the normal, as far as is known while tracing: a medium with an
+    axis, or facets of two widths."""
+    if isinstance(part, Interface | Conductor):
+        return part.is_anisotropic
+    return isinstance(part, Medium | TurbidMedium) and not part.phase.is_axisymmetric
+
+
+def has_tilted(stack: Stack) -> bool:
+    """Whether any part of a stack is not symmetric about the normal, so that azimuths are ordinates."""
+    return any(map(is_tilted, (*stack.layers, stack.base)))

@@ -15,9 +15,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from layerjax._parameters import cast_arrays
 from layerjax.normals.facets import Distribution
+from layerjax.normals.widths import Widths
 from layerjax.stack import Interface, Medium, Stack
 from layerjax.surfaces import Conductor, Lambertian, Surface
+from layerjax.transport.adding_doubling.anisotropic import anisotropic_interface, anisotropic_metal
 from layerjax.transport.adding_doubling.ballistic import subtract_ballistic
 from layerjax.transport.adding_doubling.bases import base_layer
 from layerjax.transport.adding_doubling.elements import Make, Scalars, build_element, element
@@ -29,7 +32,7 @@ from layerjax.transport.adding_doubling.media import Kernel, kernel_modes, kerne
 from layerjax.transport.adding_doubling.moments import terms
 from layerjax.transport.adding_doubling.operators import Layer, add
 from layerjax.transport.adding_doubling.requested_directions import requested_region
-from layerjax.transport.adding_doubling.resolution import Resolution, is_tilted
+from layerjax.transport.adding_doubling.resolution import Resolution, has_tilted, is_tilted
 from layerjax.transport.known_directions import DirectionLookup, KnownDirections
 from layerjax.transport.specular import is_smooth
 
@@ -57,7 +60,7 @@ class Plan(eqx.Module):
 def make_plan(stack: Stack, resolution: Resolution, multiple: bool) -> Plan:
     """The plan for a simplified stack."""
     common = any(map(is_smooth, stack.layers))
-    if any(map(is_tilted, stack.layers)):
+    if has_tilted(stack):
         nodes, azimuths = resolution.ordinates
         return Plan(nodes, azimuths // 2 + 1, azimuths, ranks(stack), multiple, common)
     return Plan(resolution.nodes, resolution.modes, None, ranks(stack), multiple, common)
@@ -106,7 +109,7 @@ def assemble(
         if isinstance(layer, Medium):
             solved.append((medium_layer(layer, found), plan.azimuths is not None and is_tilted(layer)))
         else:
-            solved.append((found, False))
+            solved.append((found, _is_expanded(found, grid)))
     whole, is_expanded = solved[-1]
     for found, tilted in reversed(solved[:-1]):
         if tilted and not is_expanded:
@@ -114,6 +117,12 @@ def assemble(
         whole = add(expand_modes(found, plan.azimuths) if is_expanded and not tilted else found, whole)
     layers = [found for found, _ in solved]
     return grid, whole, subtract_ballistic(stack, layers, whole), outer_faces(stack, layers)
+
+
+def _is_expanded(surface: Layer, grid: Grid) -> bool:
+    """Whether a surface is on ordinates by itself: its facets have two widths."""
+    reflected = surface.reflect_top.total
+    return reflected is not None and reflected.shape[-1] != grid.size
 
 
 def can_be_split(stack: Stack) -> bool:
@@ -172,6 +181,14 @@ def _interfaces(
             options = plan, layer.distribution, not leaves, next_event, region
             along = requested.below if leaves else requested.above
             layers[region] = make(_interface, options, (indices, layer.alpha), along, dtype, _interface_step)
+        elif layer.is_anisotropic:
+            layers[region] = make(
+                _anisotropic_interface,
+                (plan, layer.distribution, not leaves, region),
+                (indices, layer.width),
+                None,
+                dtype,
+            )
         else:
             by_kind[layer.distribution, not leaves].append(region)
     for kind, regions in by_kind.items():
@@ -215,6 +232,18 @@ def _interface(
         enters=enters,
         requested=outside,
         next_event=next_event,
+    )
+
+
+def _anisotropic_interface(
+    plan: Plan, distribution: Distribution, enters: bool, region: int, numbers: tuple[Scalars, Widths], _: None
+) -> Layer:
+    indices, widths = numbers
+    grid = _grid(plan, indices, indices[0].dtype)
+    normals = Normals(cast_arrays(widths, indices[0].dtype), distribution)
+    assert plan.azimuths is not None
+    return anisotropic_interface(
+        grid, grid.regions[region], grid.regions[region + 1], normals, plan.azimuths, enters=enters
     )
 
 
@@ -266,7 +295,10 @@ def _kernel(plan: Plan, region: int, fresnel: bool, tilted: bool, dtype: Any, nu
 def _base(plan: Plan, region: int, dtype: Any, numbers: Any, _: None) -> Layer:
     indices, base = numbers
     here = _grid(plan, indices, dtype).regions[region]
-    return base_layer(here, _relative_conductor(base, here.ior), plan.modes, plan.multiple)
+    base = _relative_conductor(base, here.ior)
+    if is_tilted(base) and isinstance(base, Conductor) and plan.azimuths is not None:
+        return anisotropic_metal(here, base, plan.azimuths)
+    return base_layer(here, base, plan.modes, plan.multiple)
 
 
 def requested_stack(stack: Stack, known: DirectionLookup) -> tuple[Stack, KnownDirections] | None:
@@ -276,7 +308,7 @@ def requested_stack(stack: Stack, known: DirectionLookup) -> tuple[Stack, KnownD
     A smooth interface lets in none that is not along the nodes.
     """
     outer = [layer for layer in (*stack.layers[:1], *stack.layers[-1:]) if isinstance(layer, Interface)]
-    if any(map(is_tilted, stack.layers)) or not stack.layers or not isinstance(stack.layers[0], Interface):
+    if has_tilted(stack) or not stack.layers or not isinstance(stack.layers[0], Interface):
         return None
     if outer[0].is_smooth or (stack.base is None and outer[-1].is_smooth):
         return None

@@ -56,8 +56,8 @@ from layerjax.transport.adding_doubling.resolution import (
     ORDINATES,
     Resolution,
     choose_resolution,
+    has_tilted,
     is_guessed,
-    is_tilted,
     modes_for,
     resolutions,
     shortage,
@@ -233,7 +233,7 @@ class AddingDoubling(DeterministicTransport):
 
     def resolve_options_for_albedo(self, stack: Stack) -> "AddingDoubling":
         """Lobes too narrow for the nodes are no shortage: each node sends their light to itself, as mirrors do."""
-        if self.tolerance is not None or any(map(is_tilted, stack.layers)) or shortage(stack, False) is None:
+        if self.tolerance is not None or has_tilted(stack) or shortage(stack, False) is None:
             return self.resolve_options(stack, lambda: None)
         return self._with_resolution(self._resolution(stack, False))
 
@@ -433,7 +433,7 @@ class AddingDoubling(DeterministicTransport):
         return Resolution(nodes, self.modes or modes, self.ordinates or by_stack.ordinates)
 
     def _chooses_resolution(self, stack: Stack) -> bool:
-        if any(map(is_tilted, stack.layers)):
+        if has_tilted(stack):
             return self.ordinates is None
         return self.nodes is None
 

@@ -20,7 +20,14 @@ from layerjax.directions import Vector, flip, is_above, sanitise, select
 from layerjax.normals.vmf import Masking, concentration
 from layerjax.stack import Interface, Medium, Stack, is_known, media_of
 from layerjax.surfaces import Conductor
-from layerjax.transport.contract import TEXELS, DeterministicTransport, Side, refuse_film, refuse_smooth
+from layerjax.transport.contract import (
+    TEXELS,
+    DeterministicTransport,
+    Side,
+    refuse_anisotropic,
+    refuse_film,
+    refuse_smooth,
+)
 from layerjax.transport.endf import sampling
 from layerjax.transport.endf.chains import Coat, Form, LowerSide, Options, UpperSide, reflections
 from layerjax.transport.endf.slab import transmissions
@@ -87,6 +94,7 @@ class ENDF(DeterministicTransport):
 
     def check(self, stack: Stack, names: Sequence[str]) -> None:
         refuse_smooth(stack, names, "ENDF")
+        refuse_anisotropic(stack, names, "ENDF")
         sides = [index for index, layer in enumerate(stack.layers) if isinstance(layer, Interface)]
         most = 2 if stack.base is None else 1
         for index, (name, layer) in enumerate(zip(names, stack.layers, strict=True)):

@@ -17,6 +17,8 @@ from layerjax._numerics import safe_div
 from layerjax.channels import Channels, pick
 from layerjax.directions import Vector, bend, mirror, sanitise, scale, select
 from layerjax.normals.facets import Distribution, draw_weight, masking, twice_projected_area
+from layerjax.normals.widths import Width, Widths
+from layerjax.stack import Interface
 from layerjax.surfaces import Conductor, Surface
 from layerjax.surfaces.interface import (
     facet_normal,
@@ -67,8 +69,17 @@ def is_base(scene: Scene, surface: Array | None) -> Array | bool:
 
 
 def roughness(scene: Scene, surface: Array | None) -> Array:
-    """Width of the normals of an interface; of a smooth one, which has none, a stand-in."""
+    """Width of the normals of an interface, the one along the tangent; of a smooth one, which has none, a stand-in."""
     return choose(surface, [0.5 if interface.is_smooth else interface.alpha for interface in scene.interfaces])
+
+
+def _widths(scene: Scene, surface: Array | None) -> Widths:
+    """Both widths of the normals of an interface."""
+    across = [
+        0.5 if face.is_smooth else (face.alpha_y if face.is_anisotropic else face.alpha) for face in scene.interfaces
+    ]
+    turned = [0.0 if face.tangent is None else face.tangent for face in scene.interfaces]
+    return Widths(roughness(scene, surface), choose(surface, across), choose(surface, turned))
 
 
 def is_smooth(scene: Scene, surface: Array | None) -> Array | bool:
@@ -102,13 +113,13 @@ def bounce(
     at_base = is_base(scene, surface)
     results = []
     if at_base is not True:
-        ior, alpha = scene.surface_ior(surface, from_above), roughness(scene, surface)
+        ior = scene.surface_ior(surface, from_above)
         u3 = u3 if refracts is None else jnp.where(refracts, 2.0, u3)
 
-        def event(distribution: Distribution) -> Bounce:
+        def event(alpha: Width, distribution: Distribution) -> Bounce:
             wo, leaves, m = interface_event(wi, ior, alpha, u1, u2, u3, distribution)
             weight = masking((wo[0], wo[1], jnp.abs(wo[2])), alpha, distribution)
-            if distribution == "vmf":
+            if distribution == "vmf" and not isinstance(alpha, Widths):
                 weight = weight * draw_weight(wi, m, alpha)
             sent: Channels = ()
             if towards is not None:
@@ -116,7 +127,7 @@ def bounce(
             return Bounce(sent, wo, wo[2] < 0, (weight,), leaves)
 
         smooth = any(scene.is_smooth)
-        met = None if all(scene.is_smooth) else _by_distribution(scene, surface, event)
+        met = None if all(scene.is_smooth) else _by_normals(scene, surface, event)
         if smooth:
             ray = _meet_smooth(wi, ior, u3, towards)
             mask = choose(surface, [jnp.asarray(kind) for kind in (*scene.is_smooth, False)])
@@ -179,12 +190,12 @@ def density(
     at_base = is_base(scene, surface)
     value: Array | None = None
     if at_base is not True:
-        ior, alpha = scene.surface_ior(surface, from_above), roughness(scene, surface)
+        ior = scene.surface_ior(surface, from_above)
 
-        def drawn(distribution: Distribution) -> Array:
+        def drawn(alpha: Width, distribution: Distribution) -> Array:
             return interface_pdf(_interface(wi, wo, ior, alpha, distribution), wi, wo, ior, alpha, distribution)
 
-        value = _by_distribution(scene, surface, drawn)
+        value = _by_normals(scene, surface, drawn)
     if at_base is not False:
         base = base_of(scene)
         assert base is not None
@@ -199,13 +210,13 @@ def interface_towards(
 ) -> tuple[Array, Array]:
     """What an interface sends to a direction of travel, per solid angle, and the density with which it is drawn."""
     wi, towards = _clamp_to_upper(orient(travel, from_above, -1.0)), orient(target, from_above)
-    ior, alpha = scene.surface_ior(surface, from_above), roughness(scene, surface)
+    ior = scene.surface_ior(surface, from_above)
 
-    def sent(distribution: Distribution) -> tuple[Array, Array]:
+    def sent(alpha: Width, distribution: Distribution) -> tuple[Array, Array]:
         value = _interface(wi, towards, ior, alpha, distribution)
         return value * jnp.abs(towards[2]), interface_pdf(value, wi, towards, ior, alpha, distribution)
 
-    return _by_distribution(scene, surface, sent)
+    return _by_normals(scene, surface, sent)
 
 
 def exit_density(
@@ -217,30 +228,37 @@ def exit_density(
     the facet, G1 / cos of `inside` and what the draw weighs, multiplied.
     """
     wi, wo = orient(leaving, above), orient(inside, above)
-    ior, alpha = scene.surface_ior(surface, above), roughness(scene, surface)
+    ior = scene.surface_ior(surface, above)
 
-    def drawn(distribution: Distribution) -> tuple[Array, Array]:
+    def drawn(alpha: Width, distribution: Distribution) -> tuple[Array, Array]:
         lobe, transmittance = refraction_lobe(wi, wo, ior, alpha, distribution)
         value = jnp.where(wo[2] < 0, 2.0 * lobe / twice_projected_area(wi[2], wi, alpha, distribution), 0.0)
         passed = transmittance * 2.0 / twice_projected_area(jnp.abs(wo[2]), wo, alpha, distribution)
-        if distribution != "vmf":
+        if distribution != "vmf" or isinstance(alpha, Widths):
             return value, passed
         weight = draw_weight(wi, facet_normal(wi, wo, ior), alpha)
         return value / weight, passed * weight
 
-    value, passed = _by_distribution(scene, surface, drawn)
+    value, passed = _by_normals(scene, surface, drawn)
     if diffuse:
         value = value + DIFFUSE_SHARE * jnp.abs(wo[2]) / jnp.pi
     return value, passed
 
 
-def _by_distribution(scene: Scene, surface: Array | None, function: Callable[[Distribution], Any]) -> Any:
-    """What the function gives for the normals of the interface; computed for every distribution that there is."""
-    kinds = [interface.distribution for interface in scene.interfaces if not interface.is_smooth]
-    result = function(kinds[0])
+def _by_normals(scene: Scene, surface: Array | None, function: Callable[[Width, Distribution], Any]) -> Any:
+    """What the function gives for the normals of the interface; computed for every kind of them that there is."""
+
+    def kind(interface: Interface) -> tuple[Distribution, bool]:
+        return interface.distribution, interface.is_anisotropic
+
+    def found(distribution: Distribution, anisotropic: bool) -> Any:
+        return function(_widths(scene, surface) if anisotropic else roughness(scene, surface), distribution)
+
+    kinds = [kind(interface) for interface in scene.interfaces if not interface.is_smooth]
+    result = found(*kinds[0])
     for other in sorted(set(kinds[1:]) - {kinds[0]}):
-        chosen = choose(surface, [jnp.asarray(interface.distribution == other) for interface in scene.interfaces])
-        result = jax.tree.map(partial(jnp.where, chosen), function(other), result)
+        chosen = choose(surface, [jnp.asarray(kind(interface) == other) for interface in scene.interfaces])
+        result = jax.tree.map(partial(jnp.where, chosen), found(*other), result)
     return result
 
 
@@ -250,7 +268,7 @@ def _weight(value: Array, density: Array, base: Surface) -> Array:
     return safe_div(value, density) if vanishes else value / density
 
 
-def _interface(wi: Vector, wo: Vector, ior: Array, alpha: Array, distribution: Distribution) -> Array:
+def _interface(wi: Vector, wo: Vector, ior: Array, alpha: Width, distribution: Distribution) -> Array:
     """BSDF of an interface, of whichever kind the side of wo asks for."""
     above = wo[2] > 0
     reflected = interface_reflection(wi, sanitise(wo, above), ior, alpha, distribution)

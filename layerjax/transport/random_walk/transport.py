@@ -133,7 +133,7 @@ def _sample(state: Stack, wi: Vector, uniforms: tuple[Array, Array, Array]) -> V
     wo = select(u < near, cosine, flip(cosine))
     facets = _facets(state)
     if facets is not None:
-        m = sample(local, facets.alpha, u1, u2, facets.distribution)
+        m = sample(local, facets.width, u1, u2, facets.distribution)
         wo = select(u < near + far, wo, reflect(local, m))
     return wo[0], wo[1], wo[2] * side
 
@@ -147,7 +147,7 @@ def _density(state: Stack, wi: Vector, wo: Vector) -> Array:
     facets = _facets(state)
     if facets is not None:
         h, _ = half_vector(local, towards)
-        mirrored = reflection_pdf(h, local, facets.alpha, facets.distribution)
+        mirrored = reflection_pdf(h, local, facets.width, facets.distribution)
         density = density + (1.0 - near - far) * jnp.where(h[2] > 0, mirrored, 0.0)
     return density
 
