@@ -4,7 +4,7 @@ Of the paper's Table 2 the shifted labels are put right. Where it has a map (of 
 constant stands, and the remark says which.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from layerjax.optical_constants import RGB_NM, metal
@@ -46,9 +46,10 @@ def stack(name: str) -> Stack:
     return material(name).build()
 
 
-def _index(name: str) -> Iterable[list[float]]:
+def _index(name: str) -> tuple[list[float], list[float]]:
     """n and k of a metal, to three digits behind the point."""
-    return (values.round(3).tolist() for values in metal(name, "rgb"))
+    ior, k = metal(name, "rgb")
+    return ior.round(3).tolist(), k.round(3).tolist()
 
 
 def _brushed_aluminium() -> Stack:
