@@ -26,7 +26,7 @@ def fitted(wi, wo, values, sigma, family=FAMILY, **options):
 
 @pytest.mark.parametrize(("turns", "identified"), [([0.0], False), ([0.0, 45.0, 90.0], True)])
 def test_one_plane_does_not_distinguish_the_width_across(turns, identified):
-    """Of relative values along the tangent alone: the width across changes them by a factor. Then the sample is turned."""
+    """Of values along the tangent, known up to a factor: the width across is another. Then the sample is turned."""
     theta_i, theta_o = (angle.ravel() for angle in np.meshgrid([10.0, 30.0, 50.0, 70.0], np.linspace(-80, 80, 33)))
     wi = np.concatenate([lj.direction(theta_i, turn, degrees=True) for turn in turns])
     azimuths = [np.where(theta_o < 0, turn, turn + 180.0) for turn in turns]
@@ -34,7 +34,7 @@ def test_one_plane_does_not_distinguish_the_width_across(turns, identified):
     values = np.asarray(lj.evaluate(brushed(0.15, 0.4, 0.0), wi, wo, SINGLE))
     width = fits.Free(0.3, 0.03, 1.0)
     fit = fitted(wi, wo, values, NOISE * values + 1e-4, brushed(width, width, 0.0), scale=fits.Free(1.0, 0.2, 5.0))
-    assert ("base.alpha_y" not in fit.unidentified) is identified
+    assert any("base.alpha_y" in direction.weights for direction in fit.unidentified) is not identified
     assert np.isfinite(fit.standard_errors["base.alpha_y"]) == identified
     assert fit.standard_errors["base.alpha"] < 0.001
 
