@@ -246,16 +246,16 @@ def _mirror_rule(wi: Vector, alpha: Array, nodes: int, *, tails: bool = False) -
     Up to pi/4 - theta_i / 2 no parallel is cut, beyond pi/4 + theta_i / 2 nothing is left of them. tails: normals do
     not end before; their angles go like a sinh.
     """
+    kappa = None if tails else vmf.concentration(alpha)
     planar, x, y = _plane(wi)
     theta = jnp.arctan2(planar, wi[2])
-    rims = [0.25 * jnp.pi + 0.5 * side * theta for side in (-1.0, 1.0)]
+    last = None if kappa is None else _last_angle(kappa)
+    rims = (0.25 * jnp.pi + 0.5 * side * theta for side in (-1.0, 1.0))
+    edges = [jnp.zeros_like(theta), *(rim if last is None else clamp_max(rim, last) for rim in rims)]
     if tails:
-        place, w_place = panels(jnp.arcsinh(jnp.stack([jnp.zeros_like(theta), *rims], axis=-1) / alpha), nodes)
+        place, w_place = panels(jnp.arcsinh(jnp.stack(edges, axis=-1) / alpha), nodes)
         polar, w_polar = alpha * jnp.sinh(place), alpha * jnp.cosh(place) * w_place
     else:
-        drop = clamp_max(TAIL * TAIL / vmf.concentration(alpha), 1.0)
-        last = 2.0 * jnp.arctan2(safe_sqrt(0.5 * drop), safe_sqrt(1.0 - 0.5 * drop))
-        edges = [jnp.zeros_like(theta), *(clamp_max(rim, last) for rim in rims)]
         polar, w_polar = panels(jnp.stack(edges, axis=-1), nodes)
     sine, cosine = jnp.sin(polar), jnp.cos(polar)
     # wo.z = cos(theta_i) cos(2 polar) + sin(theta_i) sin(2 polar) cos(phi)
@@ -273,3 +273,9 @@ def _mirror_rule(wi: Vector, alpha: Array, nodes: int, *, tails: bool = False) -
     weight = 4.0 * facing * (sine * w_polar * rim)[..., None] * jnp.concatenate([w, w])
     shape = (*weight.shape[:-2], -1)
     return (wo[0].reshape(shape), wo[1].reshape(shape), wo[2].reshape(shape)), weight.reshape(shape)
+
+
+def _last_angle(kappa: Array) -> Array:
+    """From the normal, beyond which there are no vMF normals but for what `TAIL` says."""
+    drop = clamp_max(TAIL * TAIL / kappa, 1.0)
+    return 2.0 * jnp.arctan2(safe_sqrt(0.5 * drop), safe_sqrt(1.0 - 0.5 * drop))
