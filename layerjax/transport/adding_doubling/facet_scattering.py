@@ -124,11 +124,14 @@ def dense_refracted_rays(grid: Grid, near: Region, far: Region, normals: Normals
         return refracted_rays(near, ratio, normals, (3 * polar_count(grid) // 2, 3 * azimuth_count(grid, modes) // 2))
     assert not isinstance(normals.alpha, Widths | Tailed)
     m, weight, wi = _ggx_normals(grid, near, normals.alpha, modes)
+    return refract(wi, m, dot(wi, m), weight, ratio, normals, blur_of_refraction(polar_count(grid), ratio, normals))
+
+
+def blur_of_refraction(points: int, ratio: Array, normals: Normals) -> Array:
+    """See `fresnel.dielectric`, of so many facets from pole to rim."""
     # the squared cosine of refraction changes by so much with the angle at the facet where it is 0
     steepness = 2.0 * safe_sqrt((1.0 - ratio) * (1.0 + ratio)) / ratio
-    return refract(
-        wi, m, dot(wi, m), weight, ratio, normals, CRITICAL * facet_spacing(polar_count(grid), normals) * steepness
-    )
+    return CRITICAL * facet_spacing(points, normals) * steepness
 
 
 def facet_spacing(points: int, normals: Normals) -> Array:

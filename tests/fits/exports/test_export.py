@@ -149,7 +149,7 @@ def test_what_cannot_be_written_is_named(tmp_path):
     for material, name, to, options, message in (
         (METAL, "x.bsdf", "obj", {}, "to is 'obj', must be one of rgl, merl"),
         (METAL, "x.bsdf", "merl", {}, "must end in .binary"),
-        (TILTED, "x.binary", "merl", {}, "an axis in this stack is not the normal"),
+        (TILTED, "x.binary", "merl", {}, "axes are the normal, and facets have one width"),
         (TWO, "x.bsdf", "rgl", {}, "this stack has 2 channels: give"),
         (TWO, "x.binary", "merl", {}, "has 2 channels"),
         (TWO, "x.bsdf", "zemax", {}, "this stack has 2"),
