@@ -91,6 +91,7 @@ def density(m: Vector, alpha: Width, distribution: Distribution) -> Array:
         return ggx_density(m, alpha)
     if distribution == "beckmann":
         return beckmann_density(m, alpha)
+    assert distribution == "vmf"  # "gtr" comes with a `Tailed`
     return vmf.hemisphere_density(m, vmf.concentration(alpha))
 
 
@@ -111,6 +112,7 @@ def twice_projected_area(cosine: Array, w: Vector, alpha: Width, distribution: D
         return cosine + ggx_area(w, alpha)
     if distribution == "beckmann":
         return beckmann_area(cosine, w, alpha)
+    assert distribution == "vmf"  # "gtr" comes with a `Tailed`
     return 2.0 / vmf.masking_over_cosine(cosine, vmf.concentration(alpha))
 
 
@@ -130,6 +132,7 @@ def sample(wi: Vector, alpha: Width, u1: Array, u2: Array, distribution: Distrib
         return ggx_sample(wi, alpha, u1, u2)
     if distribution == "beckmann":
         return beckmann_sample(wi, alpha, u1, u2)
+    assert distribution == "vmf"  # "gtr" comes with a `Tailed`
     normal = vmf.hemisphere_sample(vmf.concentration(alpha), u1, jnp.zeros_like(u2))
     planar, x, y = _plane(wi)
     sine, cosine = safe_sqrt(normal[0] * normal[0] + normal[1] * normal[1]), normal[2]
@@ -149,6 +152,7 @@ def reflection_pdf(h: Vector, wi: Vector, alpha: Width, distribution: Distributi
         return ggx_density(h, alpha) * ggx_masking(wi, alpha) / (4.0 * wi[2])
     if distribution == "beckmann":
         return beckmann_density(h, alpha) / (2.0 * beckmann_area(wi[2], wi, alpha))
+    assert distribution == "vmf"  # "gtr" comes with a `Tailed`
     kappa = vmf.concentration(alpha)
     drawn = _share_drawn(wi, h, kappa) * vmf.hemisphere_norm(kappa) * vmf.hemisphere_density(h, kappa)
     return drawn / (4.0 * clamp_min(dot(wi, h), LEAST_WEIGHT))
