@@ -45,14 +45,23 @@ class Interface(ReprModule):
                                                                         to the surroundings of the stack
     alpha        alpha  ()    1    [1e-4, 1]    None     yes            width of D; [1e-4, 15] for ``"vmf"``, where
                                                                         kappa = 2 / alpha^2; None and 0: smooth
-    distribution D                 "ggx",       "ggx"    no             GGX, Beckmann (Gaussian slopes) or von
-                                   "beckmann",                          Mises-Fisher; the last two only in `ENDF`, and
-                                   "vmf"                                in `AddingDoubling` and `RandomWalk` with
-                                                                        ``facet_multiple_scattering=False``
+    distribution D                 "ggx",       "ggx"    no             GGX, Beckmann (Gaussian slopes), von
+                                   "beckmann",                          Mises-Fisher or Student-t slopes; the last three
+                                   "vmf",                               in `AddingDoubling` and `RandomWalk` with
+                                   "gtr"                                ``facet_multiple_scattering=False``, and but
+                                                                        for ``"gtr"`` in `ENDF`
     alpha_y             ()    1    [1e-4, 1]    None     yes            width across the tangent (alpha is that along
-                                                                        it); None: alpha. GGX and Beckmann
+                                                                        it); None: alpha. Not of ``"vmf"``
     tangent             ()    rad  [-pi, pi]    0        yes            azimuth of the tangent, or a vector along it
+    gamma        gamma  ()    1    [1.75, 40]   None     yes            exponent of the slopes of ``"gtr"``, which needs
+                                                                        it: small for long tails
     ============ ====== ===== ==== ============ ======== ============== ================================================
+
+    ``"gtr"``: slopes p, q are Student-t distributed, with the density
+    (1 + (p^2 + q^2) / ((gamma - 1) alpha^2))^-gamma / (pi alpha^2) (Ribardiere et al. 2017). That is GGX at gamma = 2,
+    and Beckmann of the same alpha in the limit. It is not Burley's formula of that name, but for gamma = 2. From
+    gamma = 1.5 down facets would have no finite projected area, and little above that most of what is seen at grazing
+    light is facets that stand upright, on which quadratures are not exact.
 
     With two widths, as of a brushed surface, it is in `AddingDoubling` and `RandomWalk`, with
     ``facet_multiple_scattering=False``.
@@ -71,14 +80,15 @@ class Interface(ReprModule):
     distribution: Distribution = eqx.field(static=True, default="ggx")
     alpha_y: Parameter = parameter("Interface.alpha_y", default=None, optional=True)
     tangent: Parameter = eqx.field(converter=partial(azimuth_of_tangent, "Interface.tangent"), default=None)
+    gamma: Parameter = parameter("Interface.gamma", default=None, optional=True)
 
     def __check_init__(self) -> None:
-        check_facets("Interface", self.distribution, self.alpha, self.alpha_y, self.tangent)
+        check_facets("Interface", self.distribution, self.alpha, self.alpha_y, self.tangent, self.gamma)
 
     @property
     def width(self) -> Width:
-        """Of its facets: one number, or two along and across a tangent."""
-        return width_of(self.alpha, self.alpha_y, self.tangent)
+        """Of its facets: one number, or two along and across a tangent; with gamma, where that is given."""
+        return width_of(self.alpha, self.alpha_y, self.tangent, self.gamma)
 
     @property
     def is_anisotropic(self) -> bool:

@@ -231,8 +231,8 @@ def _base(base: Any, above: float) -> dict[str, Any]:
 def _facets(surface: Any) -> dict[str, Any]:
     """Normals and widths; Mitsuba's first width is along +x, here, and its second along y."""
     kind = type(surface).__name__
-    if surface.distribution == "vmf":
-        raise ValueError(f"{kind}.distribution: Mitsuba has no 'vmf' normals")
+    if surface.distribution in ("vmf", "gtr"):
+        raise ValueError(f"{kind}.distribution: Mitsuba has no '{surface.distribution}' normals")
     if not surface.is_anisotropic:
         return {"distribution": surface.distribution, "alpha": float(surface.alpha)}
     quarters = 0.0 if surface.tangent is None else float(surface.tangent) / (0.5 * np.pi)

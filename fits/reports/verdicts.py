@@ -81,8 +81,12 @@ def residual_unit(fit: Fit) -> float:
 
 # ---- what an instrument does not resolve ----
 
-# tangent of the half vector, over alpha, at which facets are half as many as along the normal
-HALF = {"ggx": math.sqrt(math.sqrt(2.0) - 1.0), "vmf": math.sqrt(math.log(2.0))}
+# tangent of the half vector, over alpha, at which facets are half as many as along the normal (of "gtr": `half_width`)
+HALF = {
+    "ggx": math.sqrt(math.sqrt(2.0) - 1.0),
+    "beckmann": math.sqrt(math.log(2.0)),
+    "vmf": math.sqrt(math.log(2.0)),
+}
 STEPS = 2.0  # of a scan, that a lobe has to hold within its full width at half maximum
 NEAR = 10.0  # degrees from the mirror direction within which steps of a scan count
 
@@ -101,9 +105,17 @@ def instrument_limits(fit: Fit) -> dict[str, float]:
         parts = layers | {f"{prefix}base": stack.base}
         for name, part in ((f"{at}.{width}", part) for at, part in parts.items() for width in ("alpha", "alpha_y")):
             if isinstance(part, lj.Interface | lj.Conductor) and name in fit.values:
-                least = math.tan(math.radians(resolved / 4.0)) / HALF[part.distribution]
+                gamma = fit.values.get(f"{name.rpartition('.')[0]}.gamma", part.gamma)
+                least = math.tan(math.radians(resolved / 4.0)) / half_width(part.distribution, gamma)
                 found |= {name: least} if fit.values[name] < least else {}
     return found
+
+
+def half_width(distribution: str, gamma: Any) -> float:
+    """Tangent of the half vector, over alpha, at which slopes are half as dense as along the normal."""
+    if distribution != "gtr":
+        return HALF[distribution]
+    return math.sqrt((float(gamma) - 1.0) * (2.0 ** (1.0 / float(gamma)) - 1.0))
 
 
 def finest_step(data: Measurements) -> float:

@@ -7,8 +7,9 @@ or by light that is mirrored below the horizon. Points move smoothly with the wi
 no point crosses an edge of what is summed.
 
 Both coordinates are fitted to the density of normals, so that the same points serve all widths. GGX: theta_d is
-stretched like a sinh about its peak, psi by the Moebius map under which the density is nearly even. vMF and Beckmann
-normals have no tails: both coordinates end where the density of vMF normals does, which is no narrower.
+stretched like a sinh about its peak, psi by the Moebius map under which the density is nearly even; also of Student-t
+slopes, which may have tails. vMF and Beckmann normals have none: both coordinates end where the density of vMF normals
+does, which is no narrower.
 """
 
 from typing import Literal, NamedTuple
@@ -21,6 +22,7 @@ from layerjax.directions import Vector
 from layerjax.normals import vmf
 from layerjax.normals.facets import Distribution, density, twice_projected_area
 from layerjax.normals.ggx import ggx_masking
+from layerjax.normals.widths import OneWidth, Tailed, narrowest
 from layerjax.quadrature import gauss_legendre
 
 STRETCH_LIMIT = 3.0
@@ -32,9 +34,17 @@ VMF_EXTENT = 3.4
 SOFT = 0.6
 """Share of that reach within which an edge of a panel lies whose root is wholly removed."""
 
+CROWDING = 1.5
+"""Of `_crowd_at_end`, at gamma = 2: where tails are short nothing is crowded."""
+
 LEAST_COSINE = 1e-9
 
 FacetEvent = Literal["reflected", "refracted"]
+
+
+def has_tails(distribution: Distribution) -> bool:
+    """Whether points are placed as for GGX normals."""
+    return distribution in ("ggx", "gtr")
 
 
 class Parallels(NamedTuple):
@@ -60,7 +70,7 @@ def parallels(
     cosine: Array,
     sine: Array,
     polar: tuple[Array, Array],
-    alpha: Array,
+    width: OneWidth,
     distribution: Distribution,
     ratio: Array,
     event: FacetEvent,
@@ -69,32 +79,35 @@ def parallels(
 
     Args:
         cosine, sine: of w, (nodes,).
-        alpha, distribution: of the normals.
+        width, distribution: of the normals.
         ratio: index on the far side over that on the side of w.
         event: what becomes of the light: "reflected", to above the horizon, or "refracted".
     """
     apart, measure = polar
+    alpha = narrowest(width)
     mu, sin_w = cosine[:, None], sine[:, None]
     sin_apart, cos_apart = jnp.sin(apart), jnp.cos(apart)
     c = clamp_min(mu * cos_apart - sin_w * sin_apart, LEAST_COSINE)
     s = clamp_min(sin_w * cos_apart + mu * sin_apart, 0.0)
-    if distribution == "ggx":
+    if has_tails(distribution):
         # the density of normals is that of 1 / (near + (far - near) sin(psi/2)^2)^2, nearly
         scale = 1.0 / (1.0 + 0.5 * alpha * alpha)
         least = 0.5 * alpha * alpha * scale
         near = least + scale * sin_apart * sin_apart / (1.0 + clamp_min(cos_apart, 0.0))
         far = least + scale * clamp_min(1.0 - mu * c + sin_w * s, 0.0)
         squeeze = jnp.sqrt(near / far)
+    else:
+        squeeze = jnp.ones_like(s)
+    if distribution == "ggx":
         visible = ggx_masking((-sin_w, jnp.zeros_like(mu), mu), alpha) / mu
         scale_of_density = (8.0 / jnp.pi) * alpha * alpha
     else:
-        squeeze = jnp.ones_like(s)
-        visible = 2.0 / twice_projected_area(mu, (-sin_w, jnp.zeros_like(mu), mu), alpha, distribution)
+        visible = 2.0 / twice_projected_area(mu, (-sin_w, jnp.zeros_like(mu), mu), width, distribution)
         scale_of_density = jnp.asarray(8.0, mu.dtype)
     # psi ends where the normal, or the light mirrored at it, reaches the horizon
     level, swing = mu * c - (0.5 * mu / c if event == "reflected" else 0.0), sin_w * s
     end = _azimuth_of(swing, level, squeeze)
-    if distribution != "ggx":
+    if not has_tails(distribution):
         # the density goes like exp(-2 kappa sin_w s sin(psi/2)^2): by this sine, and up to a tangent of psi/4 beyond it
         last = VMF_EXTENT / jnp.sqrt(1.0 + 2.0 * vmf.concentration(alpha) * swing)
         end = clamp_max(end, 0.5 * last * (1.0 + last * last))
@@ -115,7 +128,7 @@ def _azimuth_of(swing: Array, level: Array, squeeze: Array) -> Array:
 
 
 def visible_normals(
-    cosine: Array, sine: Array, circles: Parallels, alpha: Array, distribution: Distribution, azimuths: int
+    cosine: Array, sine: Array, circles: Parallels, width: OneWidth, distribution: Distribution, azimuths: int
 ) -> tuple[Vector, Array, Array]:
     """Normals m seen along w = (-sine, 0, cosine), m . w, and their shares of the visible area: (nodes, points) each.
 
@@ -125,19 +138,22 @@ def visible_normals(
     Args:
         cosine, sine: of w, (nodes,).
         circles: where they lie.
-        alpha, distribution: of the normals.
+        width, distribution: of the normals.
         azimuths: points in psi.
     """
+    alpha = narrowest(width)
     mu, sin_w = cosine[:, None], sine[:, None]
     # tan(psi/2) is squeezed; in terms of v, the tangent of half of the angle that has it then
     x, w = (jnp.asarray(array, mu.dtype) for array in gauss_legendre(azimuths))
-    width, v = circles.end, circles.end[..., None] * x
+    if isinstance(width, Tailed):
+        x, w = _crowd_at_end(x, w, width.gamma)
+    length, v = circles.end, circles.end[..., None] * x
     if circles.start is not None:
-        width = circles.end - circles.start
-        v = circles.start[..., None] + width[..., None] * x
+        length = circles.end - circles.start
+        v = circles.start[..., None] + length[..., None] * x
     cos_half, sin_half = (1.0 - v) * (1.0 + v), 2.0 * circles.squeeze[..., None] * v
     norm = 1.0 / (cos_half * cos_half + sin_half * sin_half)
-    turn = (circles.level * width * circles.squeeze)[..., None] * w * norm * (1.0 + v * v)
+    turn = (circles.level * length * circles.squeeze)[..., None] * w * norm * (1.0 + v * v)
     back = 2.0 * sin_half * sin_half * norm  # 1 - cos(psi)
     # no differences of large numbers where lobes are narrow
     mx = circles.sine[..., None] - (mu * circles.across)[..., None] * back
@@ -148,19 +164,33 @@ def visible_normals(
         slopes = (mx / alpha) ** 2 + (my / alpha) ** 2
         shares = turn / (alpha * alpha) / (alpha * alpha) / (mz * mz + slopes) ** 2
     else:
-        shares = turn * density((mx, my, mz), alpha, distribution)
+        shares = turn * density((mx, my, mz), width, distribution)
     flat = (mu.shape[0], -1)
     facing = circles.facing[..., None] * jnp.ones_like(back)
     return (mx.reshape(flat), my.reshape(flat), mz.reshape(flat)), facing.reshape(flat), shares.reshape(flat)
 
 
+def _crowd_at_end(x: Array, w: Array, gamma: Array) -> tuple[Array, Array]:
+    """Points in (0, 1) closer to 1 and their weights: below gamma = 2 the density has no limit at upright facets."""
+    power = 1.0 + CROWDING * (2.0 / gamma) ** 5
+    rest = jnp.exp(power * jnp.log1p(-x))
+    return 1.0 - rest, power * rest / (1.0 - x) * w
+
+
 def polar_angles(
-    cosine: Array, sine: Array, alpha: Array, distribution: Distribution, ratio: Array, event: FacetEvent, points: int
+    cosine: Array,
+    sine: Array,
+    one_width: OneWidth,
+    distribution: Distribution,
+    ratio: Array,
+    event: FacetEvent,
+    points: int,
 ) -> tuple[Array, Array]:
     """theta_d - theta and its measure, (nodes, panels * points).
 
     ratio: index on the far side over that on the side of w. points: a panel; there are three.
     """
+    alpha = narrowest(one_width)
     theta = jnp.arctan2(sine, cosine)[:, None]
     total = ratio < 1.0  # reflection beyond the critical angle
     critical = jnp.where(total, jnp.arcsin(jnp.where(total, ratio, 0.5)), 0.5 * jnp.pi)
@@ -177,7 +207,7 @@ def polar_angles(
     places = _place((edges - theta) / alpha, distribution)
     first, width = places[:, :-1, None], (places[:, 1:] - places[:, :-1])[..., None]
     x, w = (jnp.asarray(array, theta.dtype) for array in gauss_legendre(points))
-    if distribution == "ggx":
+    if has_tails(distribution):
         root = edges[:, 1:] == inner  # also where nothing is totally reflected: points move smoothly as that begins
         share = jnp.where(root[..., None], 1.0 - (1.0 - x) ** 2, x)
         measure = jnp.where(root[..., None], 2.0 * (1.0 - x) * w, w)
@@ -212,7 +242,7 @@ def _smooth_edges(places: Array, x: Array) -> tuple[Array, Array]:
 
 
 def _place(t: Array, distribution: Distribution) -> Array:
-    if distribution != "ggx":
+    if not has_tails(distribution):
         return jnp.clip(t, -VMF_EXTENT, VMF_EXTENT)
     y = jnp.arcsinh(t)
     return y / jnp.sqrt(1.0 + (y / STRETCH_LIMIT) ** 2)
@@ -220,7 +250,7 @@ def _place(t: Array, distribution: Distribution) -> Array:
 
 def _inverse_place(place: Array, distribution: Distribution) -> tuple[Array, Array]:
     """t of a place, and its slope: the inverse of `_place`."""
-    if distribution != "ggx":
+    if not has_tails(distribution):
         return place, jnp.ones_like(place)
     inverse = 1.0 / jnp.sqrt(1.0 - (place / STRETCH_LIMIT) ** 2)
     y = place * inverse

@@ -1,7 +1,7 @@
-"""Normals of the facets of a rough surface: GGX, Beckmann or von Mises-Fisher, behind one set of functions.
+"""Normals of the facets of a rough surface: GGX, Beckmann, Student-t or von Mises-Fisher, behind one set of functions.
 
 Which one is known while tracing, so that none pays for another, and so is whether facets have one width or two. Masking
-is separable Smith. GGX and Beckmann normals are drawn as they are seen. Seen vMF normals have no sampler in closed
+is separable Smith. All but vMF normals are drawn as they are seen. Seen vMF normals have no sampler in closed
 form: the polar angle is drawn as it is, the azimuth about the plane of incidence from a density linear between 0 and
 the rim beyond which facets look away. None is lost, and what is left to weigh (see `draw_weight`) is 1 where normals
 are narrow, with a standard deviation of 0.5 at grazing light and of 0.6 at kappa = 0.
@@ -21,11 +21,23 @@ from layerjax.normals import vmf
 from layerjax.normals.beckmann import beckmann_area, beckmann_density, beckmann_sample
 from layerjax.normals.ggx import ggx_area, ggx_density, ggx_masking, ggx_sample
 from layerjax.normals.sggx import radii
-from layerjax.normals.widths import Width, Widths, from_unit_width, length, shrink, stretch, unit_grid
+from layerjax.normals.student import student_area, student_density, student_sample
+from layerjax.normals.widths import (
+    Tailed,
+    Width,
+    Widths,
+    from_unit_width,
+    length,
+    shrink,
+    stretch,
+    unit_grid,
+    unit_width,
+)
 from layerjax.quadrature import Nodes, flake_rule, panels
 
-Distribution = Literal["ggx", "beckmann", "vmf"]
-"""Normals of Walter et al. 2007, the first two, or von Mises-Fisher ones with kappa = 2 / alpha^2 (Guo et al. 2015)."""
+Distribution = Literal["ggx", "beckmann", "vmf", "gtr"]
+"""Normals of Walter et al. 2007, the first two, von Mises-Fisher ones with kappa = 2 / alpha^2 (Guo et al. 2015), or
+those of Student-t slopes, whose width is a `Tailed` (Ribardiere et al. 2017)."""
 
 MOST_SLOPE = 0.999
 """Slope of the density of azimuths, at most: at 1 the rim would have density 0."""
@@ -37,12 +49,18 @@ TAIL = 4.6
 """Quadratures end where kappa (1 - cos theta) is the square of this; 6e-10 of the normals lie beyond."""
 
 
-def check_facets(owner: str, distribution: Any, alpha: Any, alpha_y: Any = None, tangent: Any = None) -> None:
+def check_facets(
+    owner: str, distribution: Any, alpha: Any, alpha_y: Any = None, tangent: Any = None, gamma: Any = None
+) -> None:
     """Refuse a distribution that is none, a width outside the range that belongs to it (None: smooth), a second width
-    that cannot be, and a tangent that is none."""
+    that cannot be, a tangent that is none, and a gamma that is lacking or of no effect."""
     require_choice(f"{owner}.distribution", distribution, get_args(Distribution))
     if alpha is not None and not is_placeholder(alpha):
         check_range(f"{owner}.alpha" if distribution == "ggx" else f"{owner}.alpha, {distribution}", alpha)
+    if distribution != "gtr" and gamma is not None:
+        raise ValueError(f'{owner}.gamma: given with "{distribution}" normals; only "gtr" has it')
+    if distribution == "gtr" and gamma is None and alpha is not None:
+        raise ValueError(f'{owner}.gamma: not given, "gtr" normals need it (2: GGX, 40: nearly Beckmann)')
     if alpha_y is None:
         if tangent is not None:
             raise ValueError(f"{owner}.tangent: given without alpha_y, the width across it")
@@ -50,12 +68,14 @@ def check_facets(owner: str, distribution: Any, alpha: Any, alpha_y: Any = None,
     if alpha is None:
         raise ValueError(f"{owner}.alpha_y: given without alpha; a smooth surface has no width")
     if distribution == "vmf":
-        raise ValueError(f'{owner}.alpha_y: "vmf" normals have one width; "ggx" and "beckmann" may have two')
+        raise ValueError(f'{owner}.alpha_y: "vmf" normals have one width; "ggx", "beckmann" and "gtr" may have two')
 
 
-def width_of(alpha: Any, alpha_y: Any, tangent: Any) -> Any:
+def width_of(alpha: Any, alpha_y: Any, tangent: Any, gamma: Any = None) -> Any:
     """The width or the widths of facets, by their parameters."""
-    return alpha if alpha_y is None else Widths(alpha, alpha_y, tangent)
+    if alpha_y is not None:
+        return Widths(alpha, alpha_y, tangent, gamma)
+    return alpha if gamma is None else Tailed(alpha, gamma)
 
 
 def density(m: Vector, alpha: Width, distribution: Distribution) -> Array:
@@ -63,12 +83,15 @@ def density(m: Vector, alpha: Width, distribution: Distribution) -> Array:
     if isinstance(alpha, Widths):
         v = shrink(m, alpha)
         size = length(v)
-        unit = density(scale(1.0 / size, v), jnp.ones_like(size), distribution)
+        unit = density(scale(1.0 / size, v), unit_width(alpha, size), distribution)
         return unit / (size * size) / (alpha.alpha * size) / (alpha.alpha_y * size)
+    if isinstance(alpha, Tailed):
+        return student_density(m, alpha.alpha, alpha.gamma)
     if distribution == "ggx":
         return ggx_density(m, alpha)
     if distribution == "beckmann":
         return beckmann_density(m, alpha)
+    assert distribution == "vmf"  # "gtr" comes with a `Tailed`
     return vmf.hemisphere_density(m, vmf.concentration(alpha))
 
 
@@ -82,11 +105,14 @@ def twice_projected_area(cosine: Array, w: Vector, alpha: Width, distribution: D
         v = stretch(w, alpha)
         if distribution == "ggx":
             return cosine + length(v)
-        return twice_projected_area(cosine, v, jnp.ones_like(cosine), distribution)
+        return twice_projected_area(cosine, v, unit_width(alpha, cosine), distribution)
+    if isinstance(alpha, Tailed):
+        return student_area(cosine, w, alpha.alpha, alpha.gamma)
     if distribution == "ggx":
         return cosine + ggx_area(w, alpha)
     if distribution == "beckmann":
         return beckmann_area(cosine, w, alpha)
+    assert distribution == "vmf"  # "gtr" comes with a `Tailed`
     return 2.0 / vmf.masking_over_cosine(cosine, vmf.concentration(alpha))
 
 
@@ -98,12 +124,15 @@ def masking(w: Vector, alpha: Width, distribution: Distribution) -> Array:
 def sample(wi: Vector, alpha: Width, u1: Array, u2: Array, distribution: Distribution) -> Vector:
     """A normal that is seen from wi (above the horizon), from two uniform numbers; see `reflection_pdf`."""
     if isinstance(alpha, Widths):
-        unit = sample(normalize(stretch(wi, alpha)), jnp.ones_like(wi[2]), u1, u2, distribution)
+        unit = sample(normalize(stretch(wi, alpha)), unit_width(alpha, wi[2]), u1, u2, distribution)
         return from_unit_width(unit, alpha)
+    if isinstance(alpha, Tailed):
+        return student_sample(wi, alpha.alpha, alpha.gamma, u1, u2)
     if distribution == "ggx":
         return ggx_sample(wi, alpha, u1, u2)
     if distribution == "beckmann":
         return beckmann_sample(wi, alpha, u1, u2)
+    assert distribution == "vmf"  # "gtr" comes with a `Tailed`
     normal = vmf.hemisphere_sample(vmf.concentration(alpha), u1, jnp.zeros_like(u2))
     planar, x, y = _plane(wi)
     sine, cosine = safe_sqrt(normal[0] * normal[0] + normal[1] * normal[1]), normal[2]
@@ -117,12 +146,13 @@ def sample(wi: Vector, alpha: Width, u1: Array, u2: Array, distribution: Distrib
 
 def reflection_pdf(h: Vector, wi: Vector, alpha: Width, distribution: Distribution = "ggx") -> Array:
     """Density, 1/sr, of directions mirrored at facets that `sample` draws, by their half vector with wi."""
-    if isinstance(alpha, Widths):
+    if isinstance(alpha, Widths | Tailed):
         return density(h, alpha, distribution) / (2.0 * twice_projected_area(wi[2], wi, alpha, distribution))
     if distribution == "ggx":
         return ggx_density(h, alpha) * ggx_masking(wi, alpha) / (4.0 * wi[2])
     if distribution == "beckmann":
         return beckmann_density(h, alpha) / (2.0 * beckmann_area(wi[2], wi, alpha))
+    assert distribution == "vmf"  # "gtr" comes with a `Tailed`
     kappa = vmf.concentration(alpha)
     drawn = _share_drawn(wi, h, kappa) * vmf.hemisphere_norm(kappa) * vmf.hemisphere_density(h, kappa)
     return drawn / (4.0 * clamp_min(dot(wi, h), LEAST_WEIGHT))
@@ -142,10 +172,12 @@ def rule(wi: Vector, alpha: Width, nodes: int, distribution: Distribution) -> No
     """Quadrature over the directions above the horizon that the facets mirror wi to (see `layerjax.quadrature`)."""
     if isinstance(alpha, Widths):
         return _drawn_rule(wi, alpha, nodes, distribution)
+    if isinstance(alpha, Tailed):
+        return _mirror_rule(wi, alpha.alpha, nodes, tails=True)
     if distribution == "ggx":
         return flake_rule(wi, *radii("surface", alpha), None, nodes)[0]
     # Beckmann normals end where vMF normals as wide do, or before
-    return _mirror_rule(wi, vmf.concentration(alpha), nodes)
+    return _mirror_rule(wi, alpha, nodes)
 
 
 def visible_grid(
@@ -154,6 +186,17 @@ def visible_grid(
     """Normals seen along wi, a new last axis, and their shares of the visible area: a grid of what draws them."""
     *uniforms, weight = unit_grid(*points, round_axis=distribution == "ggx")
     u1, u2 = (jnp.asarray(u, wi[2].dtype) for u in uniforms)
+    if alpha.gamma is not None:
+        # either number draws an angle by itself
+        apart = sample(
+            (wi[0][..., None, None], wi[1][..., None, None], wi[2][..., None, None]),
+            alpha,
+            u1.reshape(points[1], points[0])[:, :1],
+            u2[: points[0]],
+            distribution,
+        )
+        m = (part.reshape(*wi[2].shape, -1) for part in apart)
+        return (next(m), next(m), next(m)), weight
     x, y, z = (jnp.broadcast_to(part[..., None], (*wi[2].shape, u1.size)) for part in wi)
     return sample((x, y, z), alpha, u1, u2, distribution), weight
 
@@ -201,17 +244,23 @@ def _share_drawn(wi: Vector, m: Vector, kappa: Array) -> Array:
     return jnp.pi * (1.0 + slope * (1.0 - 2.0 * clamp_max(phi / rim, 1.0))) / (rim * vmf.upper_share(kappa))
 
 
-def _mirror_rule(wi: Vector, kappa: Array, nodes: int) -> Nodes:
+def _mirror_rule(wi: Vector, alpha: Array, nodes: int, *, tails: bool = False) -> Nodes:
     """Normals in polar coordinates, each parallel cut where wi is mirrored to the horizon.
 
-    Up to pi/4 - theta_i / 2 no parallel is cut, beyond pi/4 + theta_i / 2 nothing is left of them.
+    Up to pi/4 - theta_i / 2 no parallel is cut, beyond pi/4 + theta_i / 2 nothing is left of them. tails: normals do
+    not end before; their angles go like a sinh.
     """
+    kappa = None if tails else vmf.concentration(alpha)
     planar, x, y = _plane(wi)
     theta = jnp.arctan2(planar, wi[2])
-    drop = clamp_max(TAIL * TAIL / kappa, 1.0)
-    last = 2.0 * jnp.arctan2(safe_sqrt(0.5 * drop), safe_sqrt(1.0 - 0.5 * drop))
-    edges = [jnp.zeros_like(theta), *(clamp_max(0.25 * jnp.pi + 0.5 * side * theta, last) for side in (-1.0, 1.0))]
-    polar, w_polar = panels(jnp.stack(edges, axis=-1), nodes)
+    last = None if kappa is None else _last_angle(kappa)
+    rims = (0.25 * jnp.pi + 0.5 * side * theta for side in (-1.0, 1.0))
+    edges = [jnp.zeros_like(theta), *(rim if last is None else clamp_max(rim, last) for rim in rims)]
+    if tails:
+        place, w_place = panels(jnp.arcsinh(jnp.stack(edges, axis=-1) / alpha), nodes)
+        polar, w_polar = alpha * jnp.sinh(place), alpha * jnp.cosh(place) * w_place
+    else:
+        polar, w_polar = panels(jnp.stack(edges, axis=-1), nodes)
     sine, cosine = jnp.sin(polar), jnp.cos(polar)
     # wo.z = cos(theta_i) cos(2 polar) + sin(theta_i) sin(2 polar) cos(phi)
     level, swing = wi[2][..., None] * jnp.cos(2.0 * polar), planar[..., None] * jnp.sin(2.0 * polar)
@@ -228,3 +277,9 @@ def _mirror_rule(wi: Vector, kappa: Array, nodes: int) -> Nodes:
     weight = 4.0 * facing * (sine * w_polar * rim)[..., None] * jnp.concatenate([w, w])
     shape = (*weight.shape[:-2], -1)
     return (wo[0].reshape(shape), wo[1].reshape(shape), wo[2].reshape(shape)), weight.reshape(shape)
+
+
+def _last_angle(kappa: Array) -> Array:
+    """From the normal, beyond which there are no vMF normals but for what `TAIL` says."""
+    drop = clamp_max(TAIL * TAIL / kappa, 1.0)
+    return 2.0 * jnp.arctan2(safe_sqrt(0.5 * drop), safe_sqrt(1.0 - 0.5 * drop))

@@ -23,21 +23,47 @@ LEAST_TANGENT = 1e-6
 """Length of what a tangent has in the plane of the surface."""
 
 
+class Tailed(eqx.Module):
+    """A width, and the exponent gamma of Student-t slopes (`layerjax.normals.student`)."""
+
+    alpha: Array
+    gamma: Array
+
+
 class Widths(eqx.Module):
-    """Widths along a tangent and across it, and the azimuth of the tangent, in radians; None: 0."""
+    """Widths along a tangent and across it, and the azimuth of the tangent, in radians; None: 0. gamma: of a `Tailed`,
+    else None."""
 
     alpha: Array
     alpha_y: Array
     tangent: Array | None = None
+    gamma: Array | None = None
 
 
-Width = Array | Widths
+OneWidth = Array | Tailed
+"""One width, with all that its distribution needs."""
+
+Width = OneWidth | Widths
 """One width, or two."""
 
 
 def narrowest(width: Width) -> Array:
     """The smaller of the widths."""
+    if isinstance(width, Tailed):
+        return jnp.asarray(width.alpha)
     return jnp.minimum(width.alpha, width.alpha_y) if isinstance(width, Widths) else jnp.asarray(width)
+
+
+def cast_width(width: OneWidth, dtype: Any) -> OneWidth:
+    """A width in a floating type."""
+    if isinstance(width, Tailed):
+        return Tailed(jnp.asarray(width.alpha, dtype), jnp.asarray(width.gamma, dtype))
+    return jnp.asarray(width, dtype)
+
+
+def unit_width(widths: Widths, like: Array) -> OneWidth:
+    """The width of the facets that two widths stretch."""
+    return jnp.ones_like(like) if widths.gamma is None else Tailed(jnp.ones_like(like), widths.gamma)
 
 
 def stretch(w: Vector, widths: Widths) -> Vector:

@@ -11,7 +11,7 @@ from layerjax import fresnel
 from layerjax.directions import Vector, add, combine, dot, half_vector, normalize, reflect, refract, scale, select
 from layerjax.normals import facets
 from layerjax.normals.facets import Distribution
-from layerjax.normals.widths import Width, Widths
+from layerjax.normals.widths import Tailed, Width, Widths
 from layerjax.surfaces.microfacet import mirror_lobe, visibility
 
 
@@ -83,7 +83,7 @@ def continued_lobe(
     x, y, z = jnp.where(exists, v[0], 0.0), jnp.where(exists, v[1], 0.0), jnp.where(exists, v[2], 1.0)
     # 1 - F with both cosines known: no difference, and no angle of total reflection
     transmitted = 2.0 * ior * a * b * (1.0 / (a + ior * b) ** 2 + 1.0 / (ior * a + b) ** 2)
-    if distribution == "ggx" and not isinstance(alpha, Widths):
+    if distribution == "ggx" and not isinstance(alpha, Widths | Tailed):
         q = x * x + y * y + (alpha * z) ** 2
         lobe = (ior * alpha * a / q) * (ior * alpha * b / q) / jnp.pi
     else:
@@ -128,7 +128,7 @@ def interface_pdf(
     density = 0.5 * f * facets.twice_projected_area(jnp.abs(wo[2]), wo, alpha, distribution)
     if distribution != "vmf":
         return density
-    assert not isinstance(alpha, Widths)
+    assert not isinstance(alpha, Widths | Tailed)
     return density / facets.draw_weight(wi, facet_normal(wi, wo, ior), alpha)
 
 

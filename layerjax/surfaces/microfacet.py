@@ -37,12 +37,16 @@ class Conductor(Surface):
                                                                            kappa = 2 / alpha^2; None and 0: a mirror
     distribution D                    "ggx",       "ggx"    no             as of an `Interface`
                                       "beckmann",
-                                      "vmf"
+                                      "vmf",
+                                      "gtr"
     film                              `ThinFilm`   None     yes            transparent film on every facet; not in
                                                                            `Statistical` and `ENDF`
     alpha_y             ()       1    [1e-4, 1]    None     yes            width across the tangent (alpha is that along
                                                                            it), as of brushed metal; None: alpha
     tangent             ()       rad  [-pi, pi]    0        yes            azimuth of the tangent, or a vector along it
+    gamma        gamma  ()       1    [1.75, 40]   None     yes            exponent of the Student-t slopes of ``"gtr"``
+                                                                           (GGX at 2, Beckmann in the limit; see
+                                                                           `Interface`)
     ============ ====== ======== ==== ============ ======== ============== =============================================
     """
 
@@ -53,9 +57,10 @@ class Conductor(Surface):
     film: ThinFilm | None = None
     alpha_y: Parameter = parameter("Conductor.alpha_y", default=None, optional=True)
     tangent: Parameter = eqx.field(converter=partial(azimuth_of_tangent, "Conductor.tangent"), default=None)
+    gamma: Parameter = parameter("Conductor.gamma", default=None, optional=True)
 
     def __check_init__(self) -> None:
-        check_facets("Conductor", self.distribution, self.alpha, self.alpha_y, self.tangent)
+        check_facets("Conductor", self.distribution, self.alpha, self.alpha_y, self.tangent, self.gamma)
         require_kind("Conductor.film", self.film, ThinFilm, None)
 
     @property
@@ -65,8 +70,8 @@ class Conductor(Surface):
 
     @property
     def width(self) -> Width:
-        """Of its facets: one number, or two along and across a tangent."""
-        return width_of(self.alpha, self.alpha_y, self.tangent)
+        """Of its facets: one number, or two along and across a tangent; with gamma, where that is given."""
+        return width_of(self.alpha, self.alpha_y, self.tangent, self.gamma)
 
     @property
     def is_anisotropic(self) -> bool:

@@ -325,7 +325,19 @@ def require_ggx(stack: Stack, names: Sequence[str], transport: str) -> None:
     refuse_anisotropic(stack, names, transport)
     for name, part in [*zip(names, stack.layers, strict=True), ("base", stack.base)]:
         if isinstance(part, Interface | Conductor) and part.distribution != "ggx":
+            others = "" if part.distribution == "gtr" else ", and ENDF for metals, coated metals and slabs"
             raise ValueError(
                 f'{name}.distribution: {transport} carries no "{part.distribution}" normals; AddingDoubling and '
-                "RandomWalk with facet_multiple_scattering=False do, and ENDF for metals, coated metals and slabs"
+                f"RandomWalk with facet_multiple_scattering=False do{others}"
+            )
+
+
+def refuse_student(stack: Stack, names: Sequence[str], transport: str) -> None:
+    """Raise a ValueError that names the first facets of Student-t slopes, on behalf of a transport that carries normals
+    by their width alone."""
+    for name, part in [*zip(names, stack.layers, strict=True), ("base", stack.base)]:
+        if isinstance(part, Interface | Conductor) and part.distribution == "gtr":
+            raise ValueError(
+                f'{name}.distribution: {transport} carries no "gtr" normals; AddingDoubling and RandomWalk with '
+                "facet_multiple_scattering=False do"
             )

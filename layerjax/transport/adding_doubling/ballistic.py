@@ -160,7 +160,7 @@ def _transmitted_bsdf(state: Ballistic, cosine_i: Array, cosine_o: Array, azimut
     from above have the density n^2 g_i cos(m) of m, those from below n^2 g_o cos(m) / n_below^2.
     """
     inner, below = state.upper.ior, state.lower.ior
-    faces = [Normals(face.alpha, face.distribution) for face in (state.upper, state.lower)]
+    faces = [Normals(face.width, face.distribution) for face in (state.upper, state.lower)]
     sine_i, sine_o = (safe_sqrt((1.0 - c) * (1.0 + c)) for c in (cosine_i, cosine_o))
     cos_phi, sin_phi = jnp.cos(azimuth)[:, None], jnp.sin(azimuth)[:, None]
     over: Vector = (-sine_i[:, None], jnp.zeros_like(cos_phi), -cosine_i[:, None])

@@ -33,7 +33,7 @@ def base_layer(region: Region, base: Surface, modes: int, multiple: bool) -> Lay
 
 
 def _conductor(region: Region, base: Conductor, kernels: Sequence[Array], multiple: bool) -> Parts:
-    normals = Normals(base.alpha, base.distribution)
+    normals = Normals(base.width, base.distribution)
 
     def seen_by(m: Vector, facing: Array, weight: Array, wi: Vector) -> tuple[Array, Array]:
         return facing, weight * smith_masking(reflect(wi, m), normals)

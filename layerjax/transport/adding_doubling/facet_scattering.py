@@ -17,7 +17,7 @@ from layerjax._numerics import clamp_max, clamp_min, safe_sqrt
 from layerjax.directions import Vector, combine, dot, normalize, reflect, sanitise
 from layerjax.normals import facets
 from layerjax.normals.facet_rule import FacetEvent, Parallels, parallels, polar_angles, visible_normals
-from layerjax.normals.widths import Width, Widths, narrowest
+from layerjax.normals.widths import Tailed, Width, Widths, cast_width, narrowest
 from layerjax.quadrature import gauss_legendre
 from layerjax.transport.adding_doubling.grid import Grid, Region
 
@@ -75,17 +75,24 @@ def map_visible_normals(
 ) -> Any:
     """function(m, m . wi, weights, wi) of the normals seen from the nodes, (nodes, points); see `visible_normals`."""
     assert not isinstance(normals.alpha, Widths)
-    alpha, kind = jnp.asarray(normals.alpha, region.cosine.dtype), normals.distribution
+    width, kind = cast_width(normals.alpha, region.cosine.dtype), normals.distribution
 
     def of_nodes(rows: tuple[Array, ...]) -> Any:
         cosine, sine, *circles = rows
         wi: Vector = (-sine[:, None], jnp.zeros_like(sine[:, None]), cosine[:, None])
-        return function(*visible_normals(cosine, sine, Parallels(*circles), alpha, kind, points[1]), wi)
+        return function(*visible_normals(cosine, sine, Parallels(*circles), width, kind, points[1]), wi)
 
-    polar = polar_angles(region.cosine, region.sine, alpha, kind, ratio, event, points[0])
+    if kind == "gtr":
+        points = _denser(points)
+    polar = polar_angles(region.cosine, region.sine, width, kind, ratio, event, points[0])
     # outside of the loop: kept in memory, not computed again for each of the facets' numbers
-    circles = parallels(region.cosine, region.sine, polar, alpha, kind, ratio, event)
+    circles = parallels(region.cosine, region.sine, polar, width, kind, ratio, event)
     return map_row_chunks(of_nodes, (region.cosine, region.sine, *circles))
+
+
+def _denser(points: tuple[int, int]) -> tuple[int, int]:
+    """Points of Student-t slopes in the place of others': half as many again, for tails of any length."""
+    return 3 * points[0] // 2, 3 * points[1] // 2
 
 
 def refract(
@@ -115,7 +122,7 @@ def dense_refracted_rays(grid: Grid, near: Region, far: Region, normals: Normals
     if normals.distribution != "ggx":
         # about the direction, not the normal: what a mirror sends back through them asks for more than their own caps
         return refracted_rays(near, ratio, normals, (3 * polar_count(grid) // 2, 3 * azimuth_count(grid, modes) // 2))
-    assert not isinstance(normals.alpha, Widths)
+    assert not isinstance(normals.alpha, Widths | Tailed)
     m, weight, wi = _ggx_normals(grid, near, normals.alpha, modes)
     return refract(wi, m, dot(wi, m), weight, ratio, normals, blur_of_refraction(polar_count(grid), ratio, normals))
 

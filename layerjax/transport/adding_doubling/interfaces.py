@@ -42,7 +42,7 @@ alone, which keep light between them."""
 STRONG = 5.0
 """One over what an interface reflects of which all may be put right; of less, a share in proportion."""
 
-LEAST_POINTS = {"ggx": (12, 6), "beckmann": (12, 8), "vmf": (12, 8)}
+LEAST_POINTS = {"ggx": (12, 6), "beckmann": (12, 8), "vmf": (12, 8), "gtr": (12, 8)}
 """Points a panel, and in azimuth, of light let in along few directions, at least, by the distribution of normals."""
 
 MOST_ENTRIES = 1 << 20

@@ -7,7 +7,7 @@ below it is turned into ordinates first, and so is every layer on top.
 from collections import defaultdict
 from functools import partial
 from operator import itemgetter
-from typing import Any
+from typing import Any, cast
 
 import equinox as eqx
 import jax
@@ -17,7 +17,7 @@ from jax import Array
 
 from layerjax._parameters import cast_arrays
 from layerjax.normals.facets import Distribution
-from layerjax.normals.widths import Widths
+from layerjax.normals.widths import OneWidth, Widths, cast_width, narrowest
 from layerjax.stack import Interface, Medium, Stack
 from layerjax.surfaces import Conductor, Lambertian, Surface
 from layerjax.transport.adding_doubling.anisotropic import anisotropic_interface, anisotropic_metal
@@ -180,7 +180,7 @@ def _interfaces(
         if requested is not None and (layer is stack.layers[0] or leaves):
             options = plan, layer.distribution, not leaves, next_event, region
             along = requested.below if leaves else requested.above
-            layers[region] = make(_interface, options, (indices, layer.alpha), along, dtype, _interface_step)
+            layers[region] = make(_interface, options, (indices, layer.width), along, dtype, _interface_step)
         elif layer.is_anisotropic:
             layers[region] = make(
                 _anisotropic_interface,
@@ -192,16 +192,16 @@ def _interfaces(
         else:
             by_kind[layer.distribution, not leaves].append(region)
     for kind, regions in by_kind.items():
-        alphas = [jnp.asarray(interfaces[region].alpha, dtype) for region in regions]
+        widths = [cast_width(cast(OneWidth, interfaces[region].width), dtype) for region in regions]
         if len(regions) < MANY:
-            for region, alpha in zip(regions, alphas, strict=True):
+            for region, width in zip(regions, widths, strict=True):
                 options = plan, *kind, next_event, region
-                layers[region] = make(_interface, options, (indices, alpha), None, dtype, _interface_step)
+                layers[region] = make(_interface, options, (indices, width), None, dtype, _interface_step)
         else:
             build = partial(_numbered_interface, plan, *kind, next_event)
             together = jax.lax.map(
                 lambda each, build=build: element(build, (indices, each[1]), each[0], dtype),
-                (jnp.asarray(regions), jnp.stack(alphas)),
+                (jnp.asarray(regions), jax.tree.map(lambda *leaves: jnp.stack(leaves), *widths)),
             )
             layers.update((region, jax.tree.map(itemgetter(k), together)) for k, region in enumerate(regions))
     return [layers[region] for region in range(len(interfaces))]
@@ -213,15 +213,15 @@ def _interface(
     enters: bool,
     next_event: NextEvent,
     region: int | Array,
-    numbers: tuple[Scalars, Array],
+    numbers: tuple[Scalars, OneWidth],
     requested: Array | None,
 ) -> Layer:
-    indices, alpha = numbers
+    indices, width = numbers
     dtype = indices[0].dtype
     grid = _grid(plan, indices, dtype)
     above, below = (_region(grid, place) for place in (region, region + 1))
     outside = None if requested is None else requested_region(requested, (above if enters else below).ior)
-    normals = Normals(jnp.asarray(alpha, dtype), distribution)
+    normals = Normals(cast_width(width, dtype), distribution)
     return interface_layer(
         grid,
         above,
@@ -257,19 +257,19 @@ def _numbered_interface(
     distribution: Distribution,
     enters: bool,
     next_event: NextEvent,
-    numbers: tuple[Scalars, Array],
+    numbers: tuple[Scalars, OneWidth],
     region: Array,
 ) -> Layer:
     """An interface under a region whose number is traced."""
     return _interface(plan, distribution, enters, next_event, region, numbers, None)
 
 
-def _interface_step(numbers: tuple[Scalars, Array]) -> float | None:
+def _interface_step(numbers: tuple[Scalars, OneWidth]) -> float | None:
     """See `linearize_element`: an interface varies with alpha and the indices like a lobe does, over its width.
 
     None where indices meet or the width ends: there its derivatives are one-sided.
     """
-    indices, width = np.asarray(numbers[0], float), float(numbers[1])
+    indices, width = np.asarray(numbers[0], float), float(narrowest(numbers[1]))
     steps = np.diff(np.sort(indices)) / np.min(indices)
     if np.min(steps) < DISTINCT or not LEAST_ALPHA < width < MOST_ALPHA:
         return None

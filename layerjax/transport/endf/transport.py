@@ -27,6 +27,7 @@ from layerjax.transport.contract import (
     refuse_anisotropic,
     refuse_film,
     refuse_smooth,
+    refuse_student,
 )
 from layerjax.transport.endf import sampling
 from layerjax.transport.endf.chains import Coat, Form, LowerSide, Options, UpperSide, reflections
@@ -95,6 +96,7 @@ class ENDF(DeterministicTransport):
     def check(self, stack: Stack, names: Sequence[str]) -> None:
         refuse_smooth(stack, names, "ENDF")
         refuse_anisotropic(stack, names, "ENDF")
+        refuse_student(stack, names, "ENDF")
         sides = [index for index, layer in enumerate(stack.layers) if isinstance(layer, Interface)]
         most = 2 if stack.base is None else 1
         for index, (name, layer) in enumerate(zip(names, stack.layers, strict=True)):

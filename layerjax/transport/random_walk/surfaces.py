@@ -17,7 +17,7 @@ from layerjax._numerics import safe_div
 from layerjax.channels import Channels, pick
 from layerjax.directions import Vector, bend, mirror, sanitise, scale, select
 from layerjax.normals.facets import Distribution, draw_weight, masking, twice_projected_area
-from layerjax.normals.widths import Width, Widths
+from layerjax.normals.widths import Tailed, Width, Widths
 from layerjax.stack import Interface
 from layerjax.surfaces import Conductor, Surface
 from layerjax.surfaces.interface import (
@@ -73,13 +73,19 @@ def roughness(scene: Scene, surface: Array | None) -> Array:
     return choose(surface, [0.5 if interface.is_smooth else interface.alpha for interface in scene.interfaces])
 
 
-def _widths(scene: Scene, surface: Array | None) -> Widths:
+def _widths(scene: Scene, surface: Array | None, distribution: Distribution) -> Widths:
     """Both widths of the normals of an interface."""
     across = [
         0.5 if face.is_smooth else (face.alpha_y if face.is_anisotropic else face.alpha) for face in scene.interfaces
     ]
     turned = [0.0 if face.tangent is None else face.tangent for face in scene.interfaces]
-    return Widths(roughness(scene, surface), choose(surface, across), choose(surface, turned))
+    gamma = _gamma(scene, surface) if distribution == "gtr" else None
+    return Widths(roughness(scene, surface), choose(surface, across), choose(surface, turned), gamma)
+
+
+def _gamma(scene: Scene, surface: Array | None) -> Array:
+    """Of the slopes of an interface; a stand-in where others have none."""
+    return choose(surface, [2.0 if face.gamma is None else face.gamma for face in scene.interfaces])
 
 
 def is_smooth(scene: Scene, surface: Array | None) -> Array | bool:
@@ -119,7 +125,7 @@ def bounce(
         def event(alpha: Width, distribution: Distribution) -> Bounce:
             wo, leaves, m = interface_event(wi, ior, alpha, u1, u2, u3, distribution)
             weight = masking((wo[0], wo[1], jnp.abs(wo[2])), alpha, distribution)
-            if distribution == "vmf" and not isinstance(alpha, Widths):
+            if distribution == "vmf" and not isinstance(alpha, Widths | Tailed):
                 weight = weight * draw_weight(wi, m, alpha)
             sent: Channels = ()
             if towards is not None:
@@ -234,7 +240,7 @@ def exit_density(
         lobe, transmittance = refraction_lobe(wi, wo, ior, alpha, distribution)
         value = jnp.where(wo[2] < 0, 2.0 * lobe / twice_projected_area(wi[2], wi, alpha, distribution), 0.0)
         passed = transmittance * 2.0 / twice_projected_area(jnp.abs(wo[2]), wo, alpha, distribution)
-        if distribution != "vmf" or isinstance(alpha, Widths):
+        if distribution != "vmf" or isinstance(alpha, Widths | Tailed):
             return value, passed
         weight = draw_weight(wi, facet_normal(wi, wo, ior), alpha)
         return value / weight, passed * weight
@@ -252,7 +258,10 @@ def _by_normals(scene: Scene, surface: Array | None, function: Callable[[Width, 
         return interface.distribution, interface.is_anisotropic
 
     def value_for(distribution: Distribution, anisotropic: bool) -> Any:
-        return function(_widths(scene, surface) if anisotropic else roughness(scene, surface), distribution)
+        if anisotropic:
+            return function(_widths(scene, surface, distribution), distribution)
+        alpha = roughness(scene, surface)
+        return function(Tailed(alpha, _gamma(scene, surface)) if distribution == "gtr" else alpha, distribution)
 
     kinds = [kind(interface) for interface in scene.interfaces if not interface.is_smooth]
     result = value_for(*kinds[0])
