@@ -132,6 +132,18 @@ def _absorb_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[tuple[Ar
     return shares, (-change, change)
 
 
+@jax.custom_jvp
+def scale_tangent(x: Array, factor: Array) -> Array:
+    """x, broadcast with the factor, whose derivative counts that many times."""
+    return jnp.broadcast_to(x, jnp.broadcast_shapes(x.shape, factor.shape))
+
+
+@scale_tangent.defjvp
+@allow_broadcasting
+def _scale_tangent_jvp(primals: tuple[Array, Array], tangents: tuple[Array, Array]) -> tuple[Array, Array]:
+    return scale_tangent(*primals), primals[1] * tangents[0]
+
+
 def horizon(dtype: jnp.dtype) -> float:
     """Cosines below this count as lying in the tangent plane: their squares must not overflow when divided by."""
     return 1e-9 if jnp.finfo(dtype).bits >= 32 else 1e-3

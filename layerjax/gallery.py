@@ -1,14 +1,16 @@
-"""Named materials: the scenes of Wang et al. 2022 (Table 2 and text), with the shifted labels of its table put right.
+"""Named materials: metals with brushed surfaces and with a film, and the scenes of Wang et al. 2022.
 
-Where the paper has a map (of orientation, thickness or colour) a constant stands, and the remark says which.
+Of the paper's Table 2 the shifted labels are put right. Where it has a map (of orientation, thickness or colour) a
+constant stands, and the remark says which.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from layerjax.optical_constants import RGB_NM, metal
 from layerjax.phase import SGGX, HenyeyGreenstein
-from layerjax.stack import Medium, Stack
-from layerjax.surfaces import Lambertian
+from layerjax.stack import Interface, Medium, Stack
+from layerjax.surfaces import Conductor, Lambertian, ThinFilm
 
 ALONG_X = (1.0, 0.0, 0.0)
 
@@ -44,6 +46,24 @@ def stack(name: str) -> Stack:
     return material(name).build()
 
 
+def _index(name: str) -> tuple[list[float], list[float]]:
+    """n and k of a metal, to three digits behind the point."""
+    ior, k = metal(name, "rgb")
+    return ior.round(3).tolist(), k.round(3).tolist()
+
+
+def _brushed_aluminium() -> Stack:
+    return Stack([], Conductor(*_index("aluminium"), 0.12, alpha_y=0.4))
+
+
+def _lacquered_copper() -> Stack:
+    return Stack([Interface(1.5, 0.08)], Conductor(*_index("copper"), 0.2, alpha_y=0.45))
+
+
+def _tinted_titanium() -> Stack:
+    return Stack([], Conductor(*_index("titanium"), 0.25, film=ThinFilm(2.4, 45.0, RGB_NM)))
+
+
 def _window_shade() -> Stack:
     threads, weave = SGGX("fiber", 0.1, ALONG_X), SGGX("fiber", 1.0)
     return Stack([Medium(1.0, [0.9, 0.9, 0.7], threads), Medium(1.0, [0.9, 0.9, 0.7], weave)])
@@ -77,6 +97,24 @@ _TABLE = "Wang et al. 2022, Table 2 and Fig. "
 _MATERIALS = {
     each.name: each
     for each in (
+        Material(
+            "brushed_aluminium",
+            "Facets of two widths, GGX",
+            "brushed along x, so that slopes across are wider; index of Rakic 1995",
+            _brushed_aluminium,
+        ),
+        Material(
+            "lacquered_copper",
+            "The same under a clear lacquer",
+            "brushed along x, index of Johnson & Christy 1972",
+            _lacquered_copper,
+        ),
+        Material(
+            "tinted_titanium",
+            "A film of 45 nm of titanium dioxide",
+            "the oxide has index 2.4 at all wavelengths, the metal that of Johnson & Christy 1974",
+            _tinted_titanium,
+        ),
         Material("window_shade", _TABLE + "1", "fibers along x in place of the orientation map", _window_shade),
         Material("fabric", _TABLE + "17", "fibers of alpha 0.1 as in the table, along x", lambda: _fabric(0.1)),
         Material("fabric_as_in_the_text", _TABLE + "17", "fibers of alpha 0.5, along x", lambda: _fabric(0.5)),

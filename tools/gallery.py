@@ -6,16 +6,21 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import numpy as np
 from PIL import Image
 
 from fits.problem.stack_file import material_to_dict
 from fits.reports.plots.data import as_png
-from fits.reports.render import render
-from layerjax import gallery
+from fits.reports.render import LIGHTS, render, sphere, to_screen
+from layerjax import AddingDoubling, gallery, prepare
 
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "gallery.md"
 PICTURES = ROOT / "docs" / "gallery"
+
+METALS = ("brushed_aluminium", "lacquered_copper", "tinted_titanium")
+METALS_PICTURE = ROOT / "docs" / "metals.jpg"
+"""The metals of the README, and their picture."""
 
 SPHERE, WIDTH, QUALITY = 256, 1000, 88
 """Pixels of a sphere and of a picture, and how well a JPEG keeps it: about 70 kB each."""
@@ -26,8 +31,9 @@ COLUMNS = 70
 BEGINNING = """\
 # Gallery
 
-The materials of `layerjax.gallery`, after the scenes of Wang et al. 2022. Where the paper has a texture map (of
-orientation, thickness or colour), the material has a constant, and its remark says so.
+The materials of `layerjax.gallery`: metals with brushed surfaces and with a thin film, and the scenes of Wang et al.
+2022. Where that paper has a texture map (of orientation, thickness or colour), the material has a constant, and its
+remark says so.
 
 In Python, `layerjax.gallery.stack("padauk")` returns the stack. In a stack file, `gallery = "padauk"` replaces the
 layers and the base. Commands take the name in place of a file:
@@ -56,14 +62,16 @@ def page() -> str:
 
 
 def _stack(tables: dict[str, Any]) -> str:
-    layers = "".join(f"        {_call(layer, 8)},\n" for layer in tables["layers"])
+    layers = "".join(f"        {_call(layer, 8)},\n" for layer in tables.get("layers", []))
     base = _call(tables["base"], 4, "base=") if "base" in tables else "None"
-    return f"lj.Stack(\n    layers=[\n{layers}    ],\n    base={base},\n)"
+    held = f"[\n{layers}    ]" if layers else "[]"
+    return f"lj.Stack(\n    layers={held},\n    base={base},\n)"
 
 
 def _call(table: dict[str, Any], indent: int, name: str = "") -> str:
     """The code of a part of a stack file, an argument a line where one line would be longer than COLUMNS."""
-    keys = sorted(table.keys() - {"kind"}, key=lambda key: (key != "shape", list(table).index(key)))
+    omitted = {"kind", *(["distribution"] if table.get("distribution") == "ggx" else [])}  # the default
+    keys = sorted(table.keys() - omitted, key=lambda key: (key != "shape", list(table).index(key)))
     items = [(key, "" if key == "shape" else f"{key}=") for key in keys]
     words = [word + _value(table[key], indent + 4, word) for key, word in items]
     line = f"lj.{table['kind']}({', '.join(words)})"
@@ -75,7 +83,7 @@ def _call(table: dict[str, Any], indent: int, name: str = "") -> str:
 
 def _value(value: Any, indent: int, name: str = "") -> str:
     if isinstance(value, dict):
-        return _call(value, indent, name)
+        return _call({"kind": "ThinFilm"} | value, indent, name)
     if isinstance(value, list):
         return f"[{', '.join(_value(part, indent) for part in value)}]"
     return repr(value).removesuffix(".0").replace("'", '"')
@@ -91,6 +99,18 @@ def picture(name: str) -> bytes:
     return file.getvalue()
 
 
+def metals() -> bytes:
+    """The picture of the README, a JPEG: spheres of the metals, side by side."""
+    shown = []
+    for name in METALS:
+        stack = gallery.stack(name)
+        shown.append(to_screen(sphere(stack, prepare(stack, AddingDoubling()), LIGHTS["lit from the front"], SPHERE)))
+    file = io.BytesIO()
+    pixels = np.round(255.0 * np.concatenate(shown, axis=1)).astype(np.uint8)
+    Image.fromarray(pixels).save(file, "jpeg", quality=QUALITY, subsampling=0, optimize=True)
+    return file.getvalue()
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m tools.gallery", description=__doc__)
     parser.add_argument("--pictures", action="store_true", help="draw the pictures as well")
@@ -101,6 +121,7 @@ def main() -> None:
             path = PICTURES / f"{name}.jpg"
             path.write_bytes(picture(name))
             print(path.relative_to(ROOT))
+        METALS_PICTURE.write_bytes(metals())
     PAGE.write_text(page())
     print(PAGE.relative_to(ROOT))
 

@@ -211,8 +211,7 @@ def _interface(interface: Any, above: float) -> dict[str, Any]:
         return {"type": "dielectric", "int_ior": below, "ext_ior": above}
     return {
         "type": "roughdielectric",
-        "distribution": _normals(interface),
-        "alpha": float(interface.alpha),
+        **_facets(interface),
         "int_ior": below,
         "ext_ior": above,
     }
@@ -225,14 +224,22 @@ def _base(base: Any, above: float) -> dict[str, Any]:
         index = {"eta": _rgb(base.ior / above), "k": _rgb(base.k / above)}
         if base.is_smooth:
             return {"type": "conductor", **index}
-        return {"type": "roughconductor", "distribution": _normals(base), "alpha": float(base.alpha), **index}
+        return {"type": "roughconductor", **_facets(base), **index}
     raise ValueError(f"base: Mitsuba has no {type(base).__name__}")
 
 
-def _normals(surface: Any) -> str:
+def _facets(surface: Any) -> dict[str, Any]:
+    """Normals and widths; Mitsuba's first width is along +x, here, and its second along y."""
+    kind = type(surface).__name__
     if surface.distribution == "vmf":
-        raise ValueError(f"{type(surface).__name__}.distribution: Mitsuba has no 'vmf' normals")
-    return str(surface.distribution)
+        raise ValueError(f"{kind}.distribution: Mitsuba has no 'vmf' normals")
+    if not surface.is_anisotropic:
+        return {"distribution": surface.distribution, "alpha": float(surface.alpha)}
+    quarters = 0.0 if surface.tangent is None else float(surface.tangent) / (0.5 * np.pi)
+    if abs(quarters - round(quarters)) > 1e-6:
+        raise ValueError(f"{kind}.tangent: {float(surface.tangent):g}, must be along x or y")
+    widths = [float(surface.alpha), float(surface.alpha_y)][:: -1 if round(quarters) % 2 else 1]
+    return {"distribution": surface.distribution, "alpha_u": widths[0], "alpha_v": widths[1]}
 
 
 def _volume(value: Any) -> dict[str, Any]:

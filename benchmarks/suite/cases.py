@@ -31,6 +31,8 @@ FAMILIES = {
     "transmitting_slabs": "slabs that transmit",
     "thick_and_conservative": "thick and conservative media",
     "grazing_light": "grazing light",
+    "smooth_surfaces": "smooth surfaces",
+    "brushed_surfaces": "brushed surfaces",
 }
 """Directory of each family to its title."""
 

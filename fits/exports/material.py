@@ -85,14 +85,16 @@ class Material:
     @property
     def isotropic(self) -> bool:
         """Whether the BSDF is invariant to rotations about the normal."""
+        surfaces = [face for part in self.parts for face in (*part.layers, part.base)]
+        facets = [face for face in surfaces if isinstance(face, lj.Interface | lj.Conductor)]
         media = [layer for part in self.parts for layer in part.layers if not isinstance(layer, lj.Interface)]
-        return all(medium.phase.is_axisymmetric for medium in media)
+        return all(m.phase.is_axisymmetric for m in media) and not any(face.is_anisotropic for face in facets)
 
     @property
     def turns_by_half(self) -> bool:
         """Whether the BSDF is invariant to half a turn about the normal: every axis is parallel or normal to it.
 
-        Only flakes and fibers have a known axis.
+        Facets of two widths are. Only flakes and fibers have a known axis.
         """
         media = [layer for part in self.parts for layer in part.layers if not isinstance(layer, lj.Interface)]
         return all(medium.phase.is_axisymmetric or _lies_flat(medium.phase.flakes) for medium in media)
@@ -123,11 +125,17 @@ def _batches(w: Floats) -> Iterator[Floats]:
 def _widths(stack: lj.Stack) -> Iterator[float]:
     for layer in stack.layers:
         if isinstance(layer, lj.Interface):
-            yield from () if layer.is_smooth else (_number(layer.alpha),)
+            yield from _of_facets(layer)
         elif layer.phase.flakes is not None and layer.phase.flakes.kind == "surface" and layer.phase.is_axisymmetric:
             yield _number(layer.phase.flakes.alpha)
-    if isinstance(stack.base, lj.Conductor) and not stack.base.is_smooth:
-        yield _number(stack.base.alpha)
+    if isinstance(stack.base, lj.Conductor):
+        yield from _of_facets(stack.base)
+
+
+def _of_facets(surface: lj.Interface | lj.Conductor) -> Iterator[float]:
+    for width in (surface.alpha, surface.alpha_y):
+        if width is not None:
+            yield _number(width)
 
 
 def _lies_flat(flakes: Flakes | None) -> bool:

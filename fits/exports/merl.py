@@ -20,7 +20,7 @@ SLABS = 10
 def contents(material: Material, wavelengths: Floats | None = None) -> Contents:
     """The file: reflection above the surface, in red, green and blue."""
     if not material.isotropic:
-        raise ValueError("a MERL table is of isotropic materials, and an axis in this stack is not the normal")
+        raise ValueError("a MERL table is of isotropic materials: axes are the normal, and facets have one width")
     if material.channels not in (1, len(CHANNELS)):
         raise ValueError(f"a MERL table has red, green and blue, this stack has {material.channels} channels")
     table = np.full((len(CHANNELS), *SHAPE), UNMEASURED)

@@ -77,7 +77,9 @@ def _narrowest(material: lj.Stack | lj.Mixture) -> tuple[float, float]:
             if isinstance(part, lj.Interface | lj.Conductor):
                 if part.is_smooth:  # what it mirrors is not in the values
                     continue
-                facets.append(float(np.min(at_start(part.alpha, 1))))
+                facets += [
+                    float(np.min(at_start(width, 1))) for width in (part.alpha, part.alpha_y) if width is not None
+                ]
             elif isinstance(part, lj.Medium | lj.TurbidMedium):
                 for end in (1, 2):  # at the lower bounds of what is free, and at the upper
                     phase = at_start(part.phase, end)

@@ -71,7 +71,7 @@ def render(
             figure.suptitle(title)
         above, below = np.ravel(figure.subfigures(2, 1, height_ratios=(1.0, 1.15), squeeze=False))
         for axes, name in zip(above.subplots(1, len(lights), squeeze=False)[0], lights, strict=True):
-            axes.imshow(_display(sphere(stack, prepared, LIGHTS[name], size)), interpolation="none")
+            axes.imshow(to_screen(sphere(stack, prepared, LIGHTS[name], size)), interpolation="none")
             axes.set_title(name)
             axes.set_axis_off()
         left, right = np.ravel(below.subfigures(1, 2, width_ratios=(1.0, 1.25), squeeze=False))
@@ -115,7 +115,7 @@ def _sky(stack: lj.Stack | lj.Mixture, prepared: Prepared, wo: Floats) -> Floats
     return np.asarray(table(np.stack([near, np.arctan2(wo[:, 1], wo[:, 0])], axis=-1)))
 
 
-def _display(radiance: Floats) -> Floats:
+def to_screen(radiance: Floats) -> Floats:
     """Linear values to those of a screen (IEC 61966-2-1), highlights rolled off above 0.8."""
     bright = np.maximum(radiance - 0.8, 0.0)
     shown = np.minimum(radiance, 0.8) + 0.2 * bright / (bright + 0.2)

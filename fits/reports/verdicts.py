@@ -97,8 +97,9 @@ def instrument_limits(fit: Fit) -> dict[str, float]:
     aperture = 0.0 if instrument is None else math.hypot(instrument.source_aperture, instrument.detector_aperture)
     resolved, found = max(aperture, STEPS * finest_step(fit.problem.data.used())), dict[str, float]()
     for prefix, stack in stacks_by_name(material).items() if isinstance(material, lj.Stack | lj.Mixture) else ():
-        parts = {f"{prefix}layers[{place}].alpha": layer for place, layer in enumerate(stack.layers)}
-        for name, part in (parts | {f"{prefix}base.alpha": stack.base}).items():
+        layers = {f"{prefix}layers[{place}]": layer for place, layer in enumerate(stack.layers)}
+        parts = layers | {f"{prefix}base": stack.base}
+        for name, part in ((f"{at}.{width}", part) for at, part in parts.items() for width in ("alpha", "alpha_y")):
             if isinstance(part, lj.Interface | lj.Conductor) and name in fit.values:
                 least = math.tan(math.radians(resolved / 4.0)) / HALF[part.distribution]
                 found |= {name: least} if fit.values[name] < least else {}

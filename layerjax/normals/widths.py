@@ -108,5 +108,5 @@ def azimuth_of_tangent(name: str, tangent: Any) -> Any:
 
 
 def length(v: Vector) -> Array:
-    """Of a vector."""
+    """Length of a vector."""
     return safe_sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])

@@ -18,7 +18,7 @@ def test_the_suite_is_large_and_every_family_has_stacks() -> None:
     assert len(CASES) >= 60
     assert len(NAMES) == len(CASES)
     counts = {family: sum(case.family == family for case in CASES) for family in FAMILIES}
-    assert min(counts.values()) >= 8
+    assert min(counts.values()) >= 5
     assert {path.parent.name for path in DIRECTORY.glob("*/*.toml")} == set(FAMILIES)
 
 

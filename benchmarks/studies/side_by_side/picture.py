@@ -22,6 +22,8 @@ SHOWN = {
     "transmitting_slabs": "rough_glass_slab",
     "thick_and_conservative": "white_paint",
     "grazing_light": "grazing_conductor",
+    "smooth_surfaces": "opal_pane",
+    "brushed_surfaces": "lacquer_on_brushed_metal",
 }
 """The stack of each family that is drawn."""
 

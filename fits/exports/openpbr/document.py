@@ -77,7 +77,8 @@ def _require_counterpart(material: Material) -> None:
         raise ValueError(f"an OpenPBR surface has red, green and blue, this stack has {material.channels} channels")
     if not material.isotropic:
         raise ValueError(
-            "an axis in this stack is not the normal, and no lobe of OpenPBR stands for fibers or flakes about it"
+            "this stack is not symmetric about the normal (an axis of a medium, or facets of two widths), and what is "
+            "fitted here of OpenPBR is"
         )
     if material.is_mirror:
         raise ValueError(

@@ -24,6 +24,7 @@ from layerjax.surfaces.microfacet import mirror_lobe
 from layerjax.transport.adding_doubling.facet_scattering import (
     Normals,
     azimuth_count,
+    blur_of_refraction,
     film_from,
     polar_count,
     refract,
@@ -36,6 +37,7 @@ from layerjax.transport.adding_doubling.interfaces import (
     adjoint,
     balance_flux,
     blur_of_edges,
+    critical_blur,
     largest_correction,
     reconcile_energies,
     unsampled_share,
@@ -172,7 +174,8 @@ def _rays(
 
     def mapped(function: Callable[[Vector, Array], Array]) -> Array:
         def of_facets(wi: Vector, m: Vector, share: Array) -> Array:
-            return function(*refract(wi, m, dot(wi, m), share, ratio, normals, film=film))
+            blur = blur_of_refraction(points[0], ratio, normals)
+            return function(*refract(wi, m, dot(wi, m), share, ratio, normals, blur, film))
 
         return _map_facets(of_facets, flat, normals, azimuths, points)
 
@@ -243,6 +246,8 @@ def _reflection(
     energy = clamp_max(level + resolved, 1.0 - LEAK * float(jnp.finfo(level.dtype).eps))
     wi, wo = _pairs(flat, azimuths)
     h, cosine = half_vector(wi, wo, same_side=True)
-    kernel = fresnel.dielectric(cosine, ior, film=film) * mirror_lobe(h, wi, wo, *normals)
+    along, across = wi[0] * wo[0] + wi[1] * wo[1], wi[0] * wo[1] - wi[1] * wo[0]
+    blur = critical_blur(along, across, wi[2] * wo[2], ior, 2.0 * np.pi / azimuths, 0.0)
+    kernel = fresnel.dielectric(cosine, ior, blur, film) * mirror_lobe(h, wi, wo, *normals)
     lobe = scale_to_energy(flat, kernel[None], jnp.where(flat.exists, energy, 0.0))
     return lobe + share * jnp.diag(clamp_min(rest, -level))

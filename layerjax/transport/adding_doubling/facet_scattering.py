@@ -142,10 +142,15 @@ def dense_refracted_rays(
         return refracted_rays(near, ratio, normals, points, seen)
     assert not isinstance(normals.alpha, Widths)
     m, weight, wi = _ggx_normals(grid, near, normals.alpha, modes)
+    blur = blur_of_refraction(polar_count(grid), ratio, normals)
+    return refract(wi, m, dot(wi, m), weight, ratio, normals, blur, seen)
+
+
+def blur_of_refraction(points: int, ratio: Array, normals: Normals) -> Array:
+    """See `fresnel.dielectric`, of so many facets from pole to rim."""
     # the squared cosine of refraction changes by so much with the angle at the facet where it is 0
     steepness = 2.0 * safe_sqrt((1.0 - ratio) * (1.0 + ratio)) / ratio
-    blur = CRITICAL * facet_spacing(polar_count(grid), normals) * steepness
-    return refract(wi, m, dot(wi, m), weight, ratio, normals, blur, seen)
+    return CRITICAL * facet_spacing(points, normals) * steepness
 
 
 def facet_spacing(points: int, normals: Normals) -> Array:

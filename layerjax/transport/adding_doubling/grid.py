@@ -44,6 +44,12 @@ ROUNDED_ROOT = (367 / 928, 151 / 232, 23 / 464, -31 / 232, 35 / 928)
 """Coefficients of r^0 ... r^4 of what stands for the root of r on (-1, 1): with its value and two derivatives at 1,
 level at -1, and with its mean where directions beyond 0 count by a smooth step."""
 
+DISTANT = 1e6
+"""Of s^2, over the extent of a panel: stands for the distance to the end of another region where there is none."""
+
+LEAST_ROOT = 1e-6
+"""Stands for the roots at the end of a table, which are divided by."""
+
 TABLE_DENSITY = 2
 """Points of the table of a panel for each of its nodes."""
 
@@ -292,6 +298,26 @@ def stencil(grid: Grid, ior: Array, cosine: Array, sine2: Array) -> tuple[Array,
     place = t * (points - 1)
     first = jnp.clip(jax.lax.stop_gradient(jnp.floor(place)) - 1.0, 0.0, points - 4.0)
     return first.astype(jnp.int32) + panel * points, place - first
+
+
+def root_along(grid: Grid, ior: Array, cosine: Array, sine2: Array) -> Array:
+    """`root_beyond` along directions."""
+    panel = _panel(grid, ior * ior * sine2)
+    return root_beyond(grid, panel, _coordinate(ior, cosine, sine2, *grid.bounds(panel, ior * ior))[0])
+
+
+def root_beyond(grid: Grid, panel: Array | np.ndarray, x2: Array) -> Array:
+    """The cosine, over its largest in a panel, in the second region whose directions end at its end or beyond.
+
+    Where nodes are common, derivatives by indices have the pole of its inverse: with another index that cosine is
+    another at the same node. It is about 1 where no second region ends nearby. x2: squared coordinate in the panel.
+    """
+    squares = jnp.stack([region.ior**2 for region in grid.regions])
+    low, high = grid.bounds(grid.panels, squares)
+    reach = jnp.where(squares >= high - grid.least_width, clamp_min(squares - high, 0.0), jnp.inf)
+    width = jnp.where(high > low, high - low, 1.0)
+    gap = clamp_max(jnp.sort(reach / width, axis=-1)[:, 1], DISTANT)[panel]
+    return jax.lax.stop_gradient(clamp_min(jnp.sqrt((x2 + gap) / (1.0 + gap)), LEAST_ROOT))
 
 
 def interpolate_rows(grid: Grid, rows: Array, ior: Array, cosine: Array, sine2: Array) -> Array:

@@ -272,15 +272,24 @@ def _trapped_blur(grid: Grid, next_event: NextEvent) -> float:
 
 
 def _critical_blur(wi: Vector, wo: Vector, ior: Array, azimuth: float, polar: float) -> Array:
+    """`critical_blur` of light that comes in along x."""
+    return critical_blur(wi[0] * wo[0], wi[0] * wo[1], wi[2] * wo[2], ior, azimuth, polar)
+
+
+def critical_blur(along: Array, across: Array, upright: Array, ior: Array, azimuth: float, polar: float) -> Array:
     """See `fresnel.dielectric`: as wide as a few azimuths and, unless `polar` is 0, nodes are apart.
 
     With the root at the critical angle between them, values would change by steps as the index does, and derivatives
     would be those of no difference of values.
+
+    Args:
+        along, across: scalar and vector product of what two directions have in the plane of the surface.
+        upright: product of their z.
+        azimuth, polar: distances of azimuths and of nodes.
     """
-    along, across = wi[0] * wo[0], wi[0] * wo[1]
     squared = (CRITICAL * azimuth) ** 2 * (across * across + (azimuth * along) ** 2)
     if polar:
-        cosine = along + wi[2] * wo[2]
+        cosine = along + upright
         squared = squared + (CRITICAL_KEPT * polar) ** 2 * clamp_min((1.0 - cosine) * (1.0 + cosine), 0.0)
     return jnp.sqrt(squared) / (2.0 * ior * ior)
 

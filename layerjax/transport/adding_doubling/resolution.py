@@ -301,7 +301,7 @@ def _refracted_lobes(stack: Stack, assumed: float) -> Iterator[tuple[float, floa
 
 
 def _least_width(part: Interface | Conductor, assumed: float) -> float:
-    """Of facets."""
+    """Smallest width of the facets of an interface or a metal."""
     least = _least(part.alpha, assumed)
     return least if part.alpha_y is None else min(least, _least(part.alpha_y, assumed))
 

@@ -4,11 +4,15 @@ What is tabulated is f / ior_o^2 (mu_i + mu_o), a smooth function down to grazin
 Where the outermost layer is a smooth interface it is f / ior_o^2 over what that passes either way.
 A table is finer than the grid: polynomials in the cosine and Fourier series in azimuth carry the values over. Modes are
 summed at its azimuths, 0 to pi, so that a pair reads 64 numbers however many modes there are.
+
+Under smooth interfaces, whose regions have common nodes, derivatives by indices have poles at grazing light, which
+polynomials do not follow. Tables therefore hold derivatives times the cosines, see `root_beyond`, and readers divide.
 """
 
 import math
-from collections.abc import Callable
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -16,11 +20,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from layerjax._numerics import horizon, safe_div
+from layerjax._numerics import allow_broadcasting, horizon, safe_div, scale_tangent
 from layerjax.channels import Channels, map_channels, multiply
 from layerjax.directions import Vector, select
+from layerjax.quadrature import gauss_legendre
 from layerjax.transport.adding_doubling.energies import OuterFace, node_shares
-from layerjax.transport.adding_doubling.grid import Grid, Region, stencil, table_matrix
+from layerjax.transport.adding_doubling.grid import Grid, Region, root_along, root_beyond, stencil, table_matrix
 from layerjax.transport.adding_doubling.interpolate import Axis, look_up
 from layerjax.transport.adding_doubling.operators import Layer, Operator, rotate
 from layerjax.transport.contract import Side
@@ -56,12 +61,13 @@ class Tables(eqx.Module):
 
 
 class _End(NamedTuple):
-    """The medium above or below the stack: its nodes, matrices from values there to the points of a table, and what a
-    smooth interface passes of light along the nodes (None: there is none)."""
+    """The medium above or below the stack: its nodes, matrices from values there to the points of a table, what a
+    smooth interface passes of light along the nodes (None: there is none), and `_roots`."""
 
     region: Region
     lift: Array
     passed: Array | None
+    roots: tuple[Array, Array] | None
 
 
 def make_tables(
@@ -91,7 +97,12 @@ def make_tables(
     modes = max(flux.shape[1] for flux in jax.tree.leaves(whole))
     steps = None if azimuths is not None or modes == 1 else MODE_DENSITY * modes
     top, bottom = (
-        _End(region, _lift(grid, region, modes, azimuths), None if window is None else _passed(window, region))
+        _End(
+            region,
+            _lift(grid, region, modes, azimuths),
+            None if window is None else _passed(window, region),
+            _roots(grid, azimuths),
+        )
         for region, window in zip((grid.regions[0], grid.regions[-1]), windows, strict=True)
     )
     values = _values(rest, top, bottom, azimuths, steps, opaque)
@@ -103,7 +114,7 @@ def make_tables(
     for (end, found, side), face in zip(lit, faces or (None, None), strict=False):
         if faces is not None:
             weight = jnp.repeat(end.region.weight, azimuths or 1)
-            rows.append(list(node_shares(found, face, weight) @ end.lift[0].T))
+            rows.append(list(_lift_energies(node_shares(found, face, weight), end)))
         else:
             directions = _node_directions(end.region, azimuths, side)
             share = interaction_probability(directions)
@@ -167,7 +178,7 @@ def _quadrant(
         leaving, entering = (jnp.repeat(_share_passed(end), count, axis=-1) for end in (out, into))
         shares = leaving[:, None, :, None] * entering[:, None, None, :]
         values = safe_div(mean, jnp.broadcast_to(shares, mean.shape))
-    fine = out.lift @ values @ jnp.swapaxes(into.lift, -1, -2)
+    fine = _lift_values(values, out, into)
     if steps is None:
         return fine[:, 0]
     return jnp.einsum("cmij,mp->cijp", fine, jnp.asarray(_waves(values.shape[1], steps), fine.dtype))
@@ -187,7 +198,72 @@ def _energy(flux: Operator, onward: Channels | None, share: Channels | None, end
     if onward is not None:
         leaving = leaving + jnp.stack(onward)
     met = jnp.ones((1, lift.shape[-1]), lift.dtype) if share is None else jnp.stack(share)
-    return safe_div(leaving, jnp.broadcast_to(met, jnp.broadcast_shapes(leaving.shape, met.shape))) @ lift.T
+    return _lift_energies(safe_div(leaving, jnp.broadcast_to(met, jnp.broadcast_shapes(leaving.shape, met.shape))), end)
+
+
+def _roots(grid: Grid, azimuths: int | None) -> tuple[Array, Array] | None:
+    """`root_beyond` at the nodes and at the points of a table, in proportion to the inverse of which derivatives by
+    indices are; None where they are not."""
+    if not grid.common:
+        return None
+    dtype, count = grid.edges.dtype, azimuths or 1
+    nodes, points = gauss_legendre(grid.nodes)[0], table_matrix(grid.nodes)[0]
+    at_nodes, at_points = (
+        root_beyond(grid, grid.panels, jnp.asarray(x * x, dtype)[None]).ravel() for x in (nodes, points)
+    )
+    return jnp.repeat(at_nodes, count), jnp.repeat(at_points, count if azimuths is None else AZIMUTH_DENSITY * count)
+
+
+def _lift_energies(values: Array, end: _End) -> Array:
+    """Values (..., nodes) at the points of a table."""
+    if end.roots is None:
+        return values @ end.lift[0].T
+    return _lift_weighted(values, (end.lift[0],), *end.roots)
+
+
+def _lift_values(values: Array, out: _End, into: _End) -> Array:
+    """Values (..., nodes, nodes) at the points of a table."""
+    lifts = out.lift, into.lift
+    if out.roots is None or into.roots is None:
+        return _lift_axes(values, lifts)
+    return _lift_weighted(values, lifts, *(jnp.outer(*pair) for pair in zip(out.roots, into.roots, strict=True)))
+
+
+def _lift_axes(values: Array, lifts: tuple[Array, ...]) -> Array:
+    """Matrices on the last axis, or on the last two."""
+    *out, into = lifts
+    return (out[0] @ values if out else values) @ jnp.swapaxes(into, -1, -2)
+
+
+@jax.custom_jvp
+def _lift_weighted(values: Array, lifts: tuple[Array, ...], at_nodes: Array, at_points: Array) -> Array:
+    """`_lift_axes`, whose derivatives are those times `at_points`, see `_read`: polynomials carry them over weighted,
+    for alone they have poles.
+
+    at_nodes, at_points: products of roots along all axes, see `_roots`.
+    """
+    return _lift_axes(values, lifts)
+
+
+@_lift_weighted.defjvp
+@allow_broadcasting
+def _lift_weighted_jvp(primals: Any, tangents: Any) -> tuple[Array, Array]:
+    values, lifts, at_nodes, at_points = primals
+    fine, moved = jax.jvp(partial(_lift_axes, values), (lifts,), (tangents[1],))
+    return fine, at_points * moved + _lift_axes(at_nodes * tangents[0], lifts)
+
+
+def _read(
+    tables: Tables, values: Sequence[Array], start: Array, axes: list[Axis], along: list[tuple[Vector, Array]]
+) -> Channels:
+    """Values of tables along directions, each with its index; derivatives of what is in the tables are weighted by the
+    roots there, and those by the place in them are not."""
+    if not tables.grid.common:
+        return look_up(values, start, axes)
+    roots = [root_along(tables.grid, ior, w[2], w[0] * w[0] + w[1] * w[1]) for w, ior in along]
+    weight = math.prod(roots[1:], start=roots[0])
+    axes = [axis._replace(place=scale_tangent(axis.place, weight)) for axis in axes]
+    return tuple(scale_tangent(value, 1.0 / weight) for value in look_up(values, start, axes))
 
 
 def read_rest(tables: Tables, wi: Vector, wo: Vector, side: Side) -> Channels:
@@ -220,7 +296,7 @@ def read_rest(tables: Tables, wi: Vector, wo: Vector, side: Side) -> Channels:
     if tables.steps is not None:
         axes.append(_azimuth_points(into, out, tables.steps))
     factors = tuple(jnp.where(valid, scale * weight, 0.0) for weight in _weight(tables, out, into, quadrant))
-    return multiply(factors, look_up(tables.values, start, axes))
+    return multiply(factors, _read(tables, tables.values, start, axes, [(out, ior_out), (into, ior_into)]))
 
 
 def _weight(tables: Tables, out: Vector, into: Vector, quadrant: Array) -> Channels:
@@ -251,8 +327,12 @@ def read_energies(tables: Tables, wi: Vector) -> list[Channels]:
         valid = valid & above
     row = jnp.where(above | tables.opaque, 0, 1)
     ior = jnp.where(above, tables.grid.regions[0].ior, tables.grid.regions[-1].ior)
-    axes = _points(tables, _replace_invalid(wi, valid), ior, np.pi, 1)
-    found = [look_up(tuple(jnp.moveaxis(table, 1, 0)), row * table.shape[-1], axes) for table in tables.energies]
+    wi = _replace_invalid(wi, valid)
+    axes = _points(tables, wi, ior, np.pi, 1)
+    found = [
+        _read(tables, tuple(jnp.moveaxis(table, 1, 0)), row * table.shape[-1], axes, [(wi, ior)])
+        for table in tables.energies
+    ]
     return [tuple(jnp.where(valid, energy, 0.0) for energy in energies) for energies in found]
 
 

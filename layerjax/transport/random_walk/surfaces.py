@@ -262,14 +262,14 @@ def _by_normals(scene: Scene, surface: Array | None, function: Callable[[Width, 
     def kind(interface: Interface) -> tuple[Distribution, bool]:
         return interface.distribution, interface.is_anisotropic
 
-    def found(distribution: Distribution, anisotropic: bool) -> Any:
+    def value_for(distribution: Distribution, anisotropic: bool) -> Any:
         return function(_widths(scene, surface) if anisotropic else roughness(scene, surface), distribution)
 
     kinds = [kind(interface) for interface in scene.interfaces if not interface.is_smooth]
-    result = found(*kinds[0])
+    result = value_for(*kinds[0])
     for other in sorted(set(kinds[1:]) - {kinds[0]}):
         chosen = choose(surface, [jnp.asarray(kind(interface) == other) for interface in scene.interfaces])
-        result = jax.tree.map(partial(jnp.where, chosen), found(*other), result)
+        result = jax.tree.map(partial(jnp.where, chosen), value_for(*other), result)
     return result
 
 

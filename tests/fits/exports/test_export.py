@@ -149,7 +149,7 @@ def test_what_cannot_be_written_is_named(tmp_path):
     for material, name, to, options, message in (
         (METAL, "x.bsdf", "obj", {}, "to is 'obj', must be one of rgl, merl"),
         (METAL, "x.bsdf", "merl", {}, "must end in .binary"),
-        (TILTED, "x.binary", "merl", {}, "an axis in this stack is not the normal"),
+        (TILTED, "x.binary", "merl", {}, "axes are the normal, and facets have one width"),
         (TWO, "x.bsdf", "rgl", {}, "this stack has 2 channels: give"),
         (TWO, "x.binary", "merl", {}, "has 2 channels"),
         (TWO, "x.bsdf", "zemax", {}, "this stack has 2"),
@@ -163,7 +163,7 @@ def test_what_cannot_be_written_is_named(tmp_path):
         (lj.Stack([], lj.Conductor(0.2, 3.9, np.full((2, 2, 1), 0.1))), "x.bsdf", "rgl", {}, "map"),
         ("copper", "x.bsdf", "rgl", {}, "material is 'copper', must be a Stack, a Mixture or a Fit"),
         (TWO, "x.mtlx", "openpbr", {}, "this stack has 2 channels"),
-        (FIBERS, "x.mtlx", "openpbr", SINGLE, "no lobe"),
+        (FIBERS, "x.mtlx", "openpbr", SINGLE, "not symmetric about the normal"),
         (lj.Stack([lj.Medium(0.7, 0.9)]), "x.mtlx", "openpbr", SINGLE, "% of the light is transmitted"),
     ):
         if to == "openpbr":

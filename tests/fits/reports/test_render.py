@@ -6,7 +6,7 @@ import pytest
 from matplotlib.figure import Figure
 
 import layerjax as lj
-from fits.reports.render import SKY, SUN, _display, _sky, render, sphere
+from fits.reports.render import SKY, SUN, _sky, render, sphere, to_screen
 from fits.reports.results import save_fit
 
 WHITE = lj.Stack([], lj.Lambertian(1.0))
@@ -16,9 +16,9 @@ SINGLE = lj.SingleScattering()
 def test_a_white_sphere_shows_the_cosine() -> None:
     """The pixel in the middle, lit from the viewer and from 60 degrees; a pixel is flat to 1e-3."""
     for light, cosine in (((0.0, 0.0, 1.0), 1.0), ((np.sqrt(0.75), 0.0, 0.5), 0.5)):
-        picture = _display(sphere(WHITE, lj.prepare(WHITE, SINGLE), light, 65))
-        np.testing.assert_allclose(picture[32, 32], _display(np.asarray(SUN * cosine + SKY)), atol=2e-3)
-    np.testing.assert_allclose(picture[0, 0], _display(np.asarray(SKY)))  # beside the sphere
+        picture = to_screen(sphere(WHITE, lj.prepare(WHITE, SINGLE), light, 65))
+        np.testing.assert_allclose(picture[32, 32], to_screen(np.asarray(SUN * cosine + SKY)), atol=2e-3)
+    np.testing.assert_allclose(picture[0, 0], to_screen(np.asarray(SKY)))  # beside the sphere
 
 
 def test_what_loses_nothing_cannot_be_seen_under_a_sky() -> None:

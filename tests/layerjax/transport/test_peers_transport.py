@@ -36,6 +36,17 @@ COATED = {
     "a haze between interfaces": lj.Stack([lj.Interface(1.5, 0.3), haze(0.4, 1.0, 0.9), lj.Interface(1.0, 0.4)]),
     "a coat on a diffuse base": lj.Stack([lj.Interface(1.5, 0.3), haze(0.4, 0.5, 0.9)], lj.Lambertian([0.8, 0.4, 0.2])),
     "a Beckmann coat on a diffuse base": lj.Stack([lj.Interface(1.5, 0.3, "beckmann")], lj.Lambertian(0.6)),
+    "a coat on brushed metal": lj.Stack([lj.Interface(1.5, 0.3)], lj.Conductor(0.2, 3.9, 0.2, alpha_y=0.5)),
+    "a brushed coat on a diffuse base": lj.Stack(
+        [lj.Interface(1.5, 0.2, alpha_y=0.5, tangent=pi / 2), haze(0.4, 0.5, 0.9)], lj.Lambertian([0.8, 0.4, 0.2])
+    ),
+    "a haze between brushed interfaces": lj.Stack(
+        [
+            lj.Interface(1.5, 0.3, alpha_y=0.5),
+            haze(0.4, 1.0, 0.9),
+            lj.Interface(1.0, 0.5, "beckmann", alpha_y=0.3),
+        ]
+    ),
     "flakes on metal": lj.Stack(
         [flakes("surface", 0.3, None, 0.5, 0.9)], lj.Conductor([0.2, 0.9, 1.5], [3.9, 2.4, 1.9], 0.3)
     ),
@@ -116,6 +127,13 @@ SURFACES = {
     "Beckmann dielectric": (lj.Stack([lj.Interface(1.5, 0.3, "beckmann")]), ("above", "below")),
     "Beckmann conductor": (lj.Stack([], lj.Conductor(0.2, 3.9, 0.2, "beckmann")), ("above",)),
     "conductor": (lj.Stack([], lj.Conductor([0.2, 0.9, 1.5], [3.9, 2.4, 1.9], 0.2)), ("above",)),
+    "brushed dielectric": (lj.Stack([lj.Interface(1.5, 0.15, alpha_y=0.5)]), ("above", "below")),
+    "brushed dielectric, turned": (
+        lj.Stack([lj.Interface(1.5, 0.15, alpha_y=0.5, tangent=(0.0, 1.0, 0.0))]),
+        ("above", "below"),
+    ),
+    "brushed conductor": (lj.Stack([], lj.Conductor(0.2, 3.9, 0.5, alpha_y=0.1)), ("above",)),
+    "brushed Beckmann conductor": (lj.Stack([], lj.Conductor(0.2, 3.9, 0.5, "beckmann", alpha_y=0.2)), ("above",)),
 }
 
 
