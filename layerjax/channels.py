@@ -3,13 +3,15 @@
 import operator
 from collections.abc import Callable, Sequence
 from functools import reduce
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
 from jax import Array
 
 from layerjax._numerics import unstack
+
+T = TypeVar("T")
 
 Channels = tuple[Array, ...]
 """One array for all channels, or one for each."""
@@ -20,12 +22,12 @@ def per_channel(value: Array) -> tuple[Array, ...]:
     return (value,) if value.ndim == 0 else tuple(value[c] for c in range(value.shape[0]))
 
 
-def pick(values: Sequence[Array], channel: int) -> Array:
+def pick(values: Sequence[T], channel: int) -> T:
     """The value for a channel, of one for all or one for each."""
     return values[channel] if len(values) > 1 else values[0]
 
 
-def count(*values: Sequence[Array]) -> int:
+def count(*values: Sequence[Any]) -> int:
     """Number of channels that the values need together."""
     return max((len(value) for value in values), default=1)
 

@@ -4,6 +4,7 @@ Arguments broadcast against each other; a reflectance has their common shape and
 """
 
 import math
+from typing import NamedTuple
 
 import jax.numpy as jnp
 from jax import Array
@@ -21,6 +22,21 @@ COSINE = tuple((-1.0) ** k / math.factorial(2 * k) for k in range(SERIES))
 SINC = tuple((-1.0) ** k / math.factorial(2 * k + 1) for k in range(SERIES))
 
 
+class Film(NamedTuple):
+    """Coherent transparent film on a dielectric interface, at one wavelength, as it is seen from one side.
+
+    ior: index of the film relative to the medium on that side, > 0. phase: 2 pi thickness / wavelength in that medium,
+    >= 0.
+    """
+
+    ior: Array
+    phase: Array
+
+    def seen_from(self, ior: Array) -> "Film":
+        """The same from a medium of this index, relative to the one that it is counted in."""
+        return Film(self.ior / ior, self.phase * ior)
+
+
 def schlick(cosine: Array, f0: Array | float) -> Array:
     """Schlick's approximation f0 + (1 - f0) (1 - cosine)^5 (Schlick 1994).
 
@@ -34,7 +50,7 @@ def schlick(cosine: Array, f0: Array | float) -> Array:
     return f0 + (1.0 - f0) * fifth
 
 
-def dielectric(cosine: Array, ior: Array, blur: Array | None = None) -> Array:
+def dielectric(cosine: Array, ior: Array, blur: Array | None = None, film: Film | None = None) -> Array:
     """Reflectance between two dielectrics, 1 under total internal reflection.
 
     Args:
@@ -42,24 +58,41 @@ def dielectric(cosine: Array, ior: Array, blur: Array | None = None) -> Array:
         ior: index on the far side over index on the side of incidence, > 0.
         blur: of the squared cosine of refraction, half the width about 0 over which the critical angle is rounded off,
             or less, so that grazing light keeps its reflectance.
+        film: on the interface, as seen from the side of incidence.
 
     The two amplitudes are formed without a difference of squares, so that ior = 1 gives exactly 0 at every angle.
     Not differentiable at the critical angle (the derivative is infinite there; 0 is returned beyond it), unless that
     is rounded off.
     """
-    return dielectric_towards(cosine, ior, *cosine_of_refraction(cosine, ior, blur))
+    return dielectric_towards(cosine, ior, *cosine_of_refraction(cosine, ior, blur), film)
 
 
-def dielectric_towards(cosine: Array, ior: Array, refracted: Array, transmits: Array) -> Array:
+def dielectric_towards(
+    cosine: Array, ior: Array, refracted: Array, transmits: Array, film: Film | None = None
+) -> Array:
     """`dielectric` where the cosine of refraction is known, and whether there is such light."""
     refracted = jnp.where(transmits, refracted, 0.5)
     c = jnp.where(transmits, cosine, 0.5)
+    if film is not None:
+        absent = (ior == 1.0) & (film.phase == 0.0) & ~transmits
+        return jnp.where(transmits, _film_shares(c, ior, refracted, film)[0], jnp.where(absent, 0.0, 1.0))
     tiny = jnp.finfo(refracted.dtype).tiny
     perpendicular = (c - ior * refracted) / (c + ior * refracted + tiny)
     parallel = (ior * c - refracted) / (ior * c + refracted + tiny)
     reflectance = 0.5 * (perpendicular * perpendicular + parallel * parallel)
     matched = (ior == 1.0) & ~transmits  # grazing light on no interface at all
     return jnp.where(transmits, reflectance, jnp.where(matched, 0.0, 1.0))
+
+
+def dielectric_transmittance(cosine: Array, ior: Array, refracted: Array, film: Film | None = None) -> Array:
+    """1 - `dielectric` by both cosines > 0 in any unit that they share: no difference, no angle of total reflection.
+
+    With a film the cosines are those of unit vectors.
+    """
+    if film is not None:
+        return _film_shares(cosine, ior, refracted, film)[1]
+    a, b = cosine, refracted
+    return 2.0 * ior * a * b * (1.0 / (a + ior * b) ** 2 + 1.0 / (ior * a + b) ** 2)
 
 
 def cosine_of_refraction(cosine: Array, ior: Array, blur: Array | None = None) -> tuple[Array, Array]:
@@ -126,6 +159,29 @@ def thin_film(cosine: Array, ior: Array, k: Array | float, film_ior: Array, phas
     return clamp_max(0.5 * (perpendicular + parallel), 1.0)
 
 
+def _film_shares(cosine: Array, ior: Array, refracted: Array, film: Film) -> tuple[Array, Array]:
+    """Reflectance and transmittance of a film between two dielectrics, by the cosines on either side of both.
+
+    As `thin_film`, with the normal component below known: each is a quotient of sums of squares, so that their sum is 1
+    and both keep their digits at grazing angles and where one of them vanishes.
+    """
+    q1, q3 = cosine, ior * refracted
+    squared = film.ior * film.ior
+    q2 = (film.ior - 1.0) * (film.ior + 1.0) + cosine * cosine
+    phase2 = film.phase * film.phase * q2
+    c, s = _cos_and_sinc(phase2)
+    s = film.phase * s
+    passed = 4.0 * q1 * q3 * _common_factor(phase2)
+    product, below = q1 * q3, ior * ior
+    perpendicular, parallel = product - q2, q2 * below / squared - product * squared
+    perpendicular_sum = (c * (q1 + q3)) ** 2 + (s * (product + q2)) ** 2
+    parallel_sum = (c * (q3 + q1 * below)) ** 2 + (s * (q2 * below / squared + product * squared)) ** 2
+    reflected = safe_div((c * (q1 - q3)) ** 2 + (s * perpendicular) ** 2, perpendicular_sum)
+    reflected = reflected + safe_div((c * (q3 - q1 * below)) ** 2 + (s * parallel) ** 2, parallel_sum)
+    transmitted = safe_div(passed, perpendicular_sum) + safe_div(passed * below, parallel_sum)
+    return clamp_max(0.5 * reflected, 1.0), clamp_max(0.5 * transmitted, 1.0)
+
+
 def _energy(er: Array, ei: Array, hr: Array, hi: Array) -> Array:
     """|E - H|^2 / |E + H|^2."""
     return safe_div((er - hr) ** 2 + (ei - hi) ** 2, (er + hr) ** 2 + (ei + hi) ** 2)
@@ -149,3 +205,9 @@ def _cos_and_sinc(squared: Array) -> tuple[Array, Array]:
     sinc = jnp.where(squared > 0, jnp.sin(x), 0.5 * (1.0 - decayed)) / x
     near = jnp.where(small, squared, 0.0)
     return jnp.where(small, horner(COSINE, near), cosine), jnp.where(small, horner(SINC, near), sinc)
+
+
+def _common_factor(squared: Array) -> Array:
+    """cos^2 + sin^2 as `_cos_and_sinc` has them: 1, or the square of what it divides by, inverted."""
+    evanescent = squared <= -0.5
+    return jnp.where(evanescent, jnp.exp(-2.0 * jnp.sqrt(jnp.where(evanescent, -squared, 1.0))), 1.0)

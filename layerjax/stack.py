@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from layerjax._checks import abbreviate
+from layerjax._checks import abbreviate, require_kind
 from layerjax._diagram import DiagramRow, diagram
 from layerjax._numerics import safe_div
 from layerjax._parameters import Parameter, is_placeholder, leaves_with_names, parameter
@@ -24,7 +24,7 @@ from layerjax.directions import Vector
 from layerjax.normals.facets import Distribution, check_facets, width_of
 from layerjax.normals.widths import Width, azimuth_of_tangent
 from layerjax.phase import HenyeyGreenstein, PhaseFunction
-from layerjax.surfaces import Conductor, Surface
+from layerjax.surfaces import Conductor, Surface, ThinFilm
 
 LEAST_EXTINCTION = 1e-10
 """In 1/mm, stands for 0 where derivatives by the coefficients of a turbid medium may be needed."""
@@ -55,6 +55,10 @@ class Interface(ReprModule):
     tangent             ()    rad  [-pi, pi]    0        yes            azimuth of the tangent, or a vector along it
     gamma        gamma  ()    1    [1.75, 40]   None     yes            exponent of the slopes of ``"gtr"``, which needs
                                                                         it: small for long tails
+    film                           `ThinFilm`   None     yes            transparent film on it, whose reflectance
+                                                                        replaces F; in `AddingDoubling` and
+                                                                        `RandomWalk`; of a rough interface with
+                                                                        ``facet_multiple_scattering=False``
     ============ ====== ===== ==== ============ ======== ============== ================================================
 
     ``"gtr"``: slopes p, q are Student-t distributed, with the density
@@ -72,7 +76,7 @@ class Interface(ReprModule):
     Light that is blocked by masking is lost, also where the index hardly changes: with ior 1.001 and alpha 0.3, light
     at 75 degrees loses 20 % at a crossing, and a base that is lit and viewed at 75 degrees is 36 % darker. Transports
     with ``facet_multiple_scattering=True`` include this light. Omit an interface where the index does not change; one
-    with exactly the index above it is omitted automatically.
+    with exactly the index above it, and no film, is omitted automatically.
     """
 
     ior: Parameter = parameter("Interface.ior")
@@ -81,9 +85,11 @@ class Interface(ReprModule):
     alpha_y: Parameter = parameter("Interface.alpha_y", default=None, optional=True)
     tangent: Parameter = eqx.field(converter=partial(azimuth_of_tangent, "Interface.tangent"), default=None)
     gamma: Parameter = parameter("Interface.gamma", default=None, optional=True)
+    film: ThinFilm | None = None
 
     def __check_init__(self) -> None:
         check_facets("Interface", self.distribution, self.alpha, self.alpha_y, self.tangent, self.gamma)
+        require_kind("Interface.film", self.film, ThinFilm, None)
 
     @property
     def width(self) -> Width:
@@ -99,6 +105,13 @@ class Interface(ReprModule):
     def is_smooth(self) -> bool:
         """Whether it is without facets, by structure."""
         return self.alpha is None
+
+    def relative_to(self, above: Any) -> "Interface":
+        """The same interface, its index and its film counted in a medium of this index."""
+        relative = eqx.tree_at(lambda face: face.ior, self, self.ior / above)
+        if self.film is None:
+            return relative
+        return eqx.tree_at(lambda face: face.film, relative, self.film.relative_to(above))
 
 
 class Medium(ReprModule):
@@ -233,9 +246,9 @@ def require_numbers(stack: Any) -> None:
 def simplify(stack: Stack) -> Stack:
     """The same stack without what its concrete values say is not there.
 
-    Turbid media become media. Media and films of thickness 0 go, and interfaces whose index is that of what lies above
-    them (all light passes); f0 = 1 becomes None; f0 = 0 and albedo = 0 or 1 become Python floats, known while tracing.
-    Axes of media that are the normal go: what is symmetric about it is so by structure.
+    Turbid media become media. Media and films of thickness 0 go, and interfaces without a film whose index is that of
+    what lies above them (all light passes); f0 = 1 becomes None; f0 = 0 and albedo = 0 or 1 become Python floats, known
+    while tracing. Axes of media that are the normal go: what is symmetric about it is so by structure.
     Traced values are kept as they are, so derivatives with respect to them are exact.
     """
     return simplify_and_name(stack)[0]
@@ -247,7 +260,8 @@ def simplify_and_name(stack: Stack) -> tuple[Stack, tuple[str, ...]]:
     above: Any = 1.0
     for index, layer in enumerate(stack.layers):
         if isinstance(layer, Interface):
-            if _are_equal(layer.ior, above):
+            layer = _drop_film(layer)
+            if layer.film is None and _are_equal(layer.ior, above):
                 continue
             above, layer = layer.ior, _merge_widths(layer)
         if isinstance(layer, TurbidMedium):
@@ -260,12 +274,16 @@ def simplify_and_name(stack: Stack) -> tuple[Stack, tuple[str, ...]]:
                 layer = eqx.tree_at(lambda medium: medium.f0, layer, None)
         layers.append(layer)
         names.append(f"layers[{index}]")
-    base = stack.base
-    if isinstance(base, Conductor) and base.film is not None and _is_everywhere(base.film.thickness_nm, 0.0):
-        stack = eqx.tree_at(lambda s: s.base.film, stack, None)
-    if isinstance(base, Conductor):
-        stack = eqx.tree_at(lambda s: s.base, stack, _merge_widths(stack.base))
+    if isinstance(stack.base, Conductor):
+        stack = eqx.tree_at(lambda s: s.base, stack, _merge_widths(_drop_film(stack.base)))
     return eqx.tree_at(lambda s: s.layers, stack, tuple(layers)), tuple(names)
+
+
+def _drop_film(part: Any) -> Any:
+    """An interface or a conductor without its film, if that is known to have no thickness."""
+    if part.film is None or not _is_everywhere(part.film.thickness_nm, 0.0):
+        return part
+    return eqx.tree_at(lambda p: p.film, part, None)
 
 
 def _merge_widths(part: Any) -> Any:

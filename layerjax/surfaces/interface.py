@@ -8,11 +8,14 @@ import jax.numpy as jnp
 from jax import Array
 
 from layerjax import fresnel
+from layerjax._numerics import safe_div
+from layerjax.channels import Channels, mean
 from layerjax.directions import Vector, add, combine, dot, half_vector, normalize, reflect, refract, scale, select
 from layerjax.normals import facets
 from layerjax.normals.facets import Distribution
 from layerjax.normals.widths import Tailed, Width, Widths
 from layerjax.surfaces.microfacet import mirror_lobe, visibility
+from layerjax.surfaces.thin_film import BARE, Films
 
 
 def interface_reflection(wi: Vector, wo: Vector, ior: Array, alpha: Width, distribution: Distribution = "ggx") -> Array:
@@ -23,9 +26,17 @@ def interface_reflection(wi: Vector, wo: Vector, ior: Array, alpha: Width, distr
         ior: index on the far side over index on the side of wi, > 0.
         alpha, distribution: of the normals.
     """
+    (value,) = reflected_channels(wi, wo, ior, alpha, distribution, BARE)
+    return value
+
+
+def reflected_channels(
+    wi: Vector, wo: Vector, ior: Array, alpha: Width, distribution: Distribution, films: Films
+) -> Channels:
+    """`interface_reflection` under films, as seen from the side of wi."""
     h, cosine = half_vector(wi, wo, same_side=True)
     lobe = mirror_lobe(h, wi, wo, alpha, distribution)
-    return fresnel.dielectric(cosine, ior) * lobe
+    return tuple(fresnel.dielectric(cosine, ior, film=film) * lobe for film in films)
 
 
 def interface_transmission(
@@ -41,32 +52,41 @@ def interface_transmission(
         ior: index on the far side over index on the side of wi, > 0. At 1 the BTDF is a delta, and 0 is returned.
         alpha, distribution: of the normals.
     """
-    value, height = continued_transmission(wi, wo, ior, alpha, distribution)
-    return jnp.where(height > 0, value, 0.0)
+    (value,) = transmitted_channels(wi, wo, ior, alpha, distribution, BARE)
+    return value
+
+
+def transmitted_channels(
+    wi: Vector, wo: Vector, ior: Array, alpha: Width, distribution: Distribution, films: Films
+) -> Channels:
+    """`interface_transmission` through films, as seen from the side of wi."""
+    values, height = continued_transmission(wi, wo, ior, alpha, distribution, films)
+    return tuple(jnp.where(height > 0, value, 0.0) for value in values)
 
 
 def continued_transmission(
-    wi: Vector, wo: Vector, ior: Array, alpha: Width, distribution: Distribution
-) -> tuple[Array, Array]:
+    wi: Vector, wo: Vector, ior: Array, alpha: Width, distribution: Distribution, films: Films = BARE
+) -> tuple[Channels, Array]:
     """`interface_transmission` with facets that face down as well, and their height: see `continued_lobe`."""
-    lobe, transmitted, height = continued_lobe(wi, wo, ior, alpha, distribution)
-    return 4.0 * visibility(wi[2], wi, -wo[2], wo, alpha, distribution) * lobe * transmitted, height
+    lobe, transmitted, height = continued_lobe(wi, wo, ior, alpha, distribution, films)
+    visible = 4.0 * visibility(wi[2], wi, -wo[2], wo, alpha, distribution) * lobe
+    return tuple(visible * share for share in transmitted), height
 
 
 def refraction_lobe(
-    wi: Vector, wo: Vector, ior: Array, alpha: Width, distribution: Distribution = "ggx"
-) -> tuple[Array, Array]:
+    wi: Vector, wo: Vector, ior: Array, alpha: Width, distribution: Distribution = "ggx", films: Films = BARE
+) -> tuple[Array, Channels]:
     """Facets that refract wi to wo: D <wi, m> <wo, m> ior^2 / (<wi, m> + ior <wo, m>)^2, and their transmittance 1 - F.
 
     The first is 0 where no facet whose normal lies on the +z side does; wo.z < 0 is not checked.
     """
-    lobe, transmitted, height = continued_lobe(wi, wo, ior, alpha, distribution)
+    lobe, transmitted, height = continued_lobe(wi, wo, ior, alpha, distribution, films)
     return jnp.where(height > 0, lobe, 0.0), transmitted
 
 
 def continued_lobe(
-    wi: Vector, wo: Vector, ior: Array, alpha: Width, distribution: Distribution
-) -> tuple[Array, Array, Array]:
+    wi: Vector, wo: Vector, ior: Array, alpha: Width, distribution: Distribution, films: Films = BARE
+) -> tuple[Array, Channels, Array]:
     """`refraction_lobe` with facets that face down as well, D being even; and z of wi + ior wo, signed as the normal's.
 
     Where z passes through 0, at facets that stand upright, the lobe itself ends with a step.
@@ -82,7 +102,11 @@ def continued_lobe(
     b = jnp.where(exists, jnp.abs(towards_o), 1.0)
     x, y, z = jnp.where(exists, v[0], 0.0), jnp.where(exists, v[1], 0.0), jnp.where(exists, v[2], 1.0)
     # 1 - F with both cosines known: no difference, and no angle of total reflection
-    transmitted = 2.0 * ior * a * b * (1.0 / (a + ior * b) ** 2 + 1.0 / (ior * a + b) ** 2)
+    cosines = a, b
+    if films[0] is not None:
+        unit = 1.0 / jnp.sqrt(x * x + y * y + z * z)
+        cosines = unit * a, unit * b
+    transmitted = tuple(fresnel.dielectric_transmittance(cosines[0], ior, cosines[1], film) for film in films)
     if distribution == "ggx" and not isinstance(alpha, Widths | Tailed):
         q = x * x + y * y + (alpha * z) ** 2
         lobe = (ior * alpha * a / q) * (ior * alpha * b / q) / jnp.pi
@@ -106,19 +130,39 @@ def interface_sample(
     Returns the direction and whether it leaves on the side that its kind allows (reflection: above); one that does not
     is masked light, and is lost. For the density of those that do see `interface_pdf`.
     """
-    wo, leaves, _ = interface_event(wi, ior, alpha, u1, u2, u3, distribution)
+    wo, leaves, _, _ = interface_event(wi, ior, alpha, u1, u2, u3, distribution)
     return wo, leaves
 
 
 def interface_event(
-    wi: Vector, ior: Array, alpha: Width, u1: Array, u2: Array, u3: Array, distribution: Distribution
-) -> tuple[Vector, Array, Vector]:
-    """`interface_sample`, with the normal of the facet."""
+    wi: Vector,
+    ior: Array,
+    alpha: Width,
+    u1: Array,
+    u2: Array,
+    u3: Array,
+    distribution: Distribution,
+    films: Films = BARE,
+) -> tuple[Vector, Array, Vector, Channels]:
+    """`interface_sample`, with the normal of the facet, and `event_weights`; chosen by the mean of the channels."""
     m = facets.sample(wi, alpha, u1, u2, distribution)
     refracted, exists = refract(wi, m, ior)
-    reflects = (u3 < fresnel.dielectric(dot(wi, m), ior)) | ~exists
+    cosine = dot(wi, m)
+    levels = tuple(fresnel.dielectric(cosine, ior, film=film) for film in films)
+    reflects = (u3 < mean(levels)) | ~exists
     wo = select(reflects, reflect(wi, m), refracted)
-    return wo, (wo[2] > 0) == reflects, m
+    return wo, (wo[2] > 0) == reflects, m, event_weights(levels, reflects)
+
+
+def event_weights(levels: Channels, reflects: Array) -> Channels:
+    """What a draw by the mean of the channels' reflectances weighs: the share of each over its probability; of one
+    reflectance for all nothing, which stands for 1."""
+    if len(levels) == 1:
+        return ()
+    chosen = mean(levels)
+    reflected = (safe_div(level, chosen) for level in levels)
+    passed = (safe_div(1.0 - level, 1.0 - chosen) for level in levels)
+    return tuple(jnp.where(reflects, one, other) for one, other in zip(reflected, passed, strict=True))
 
 
 def interface_pdf(

@@ -91,8 +91,7 @@ class Conductor(Surface):
         relative = eqx.tree_at(lambda base: (base.ior, base.k), self, (self.ior / above, self.k / above))
         if self.film is None:
             return relative
-        film = self.film.ior / above, self.film.thickness_nm * above
-        return eqx.tree_at(lambda base: (base.film.ior, base.film.thickness_nm), relative, film)
+        return eqx.tree_at(lambda base: base.film, relative, self.film.relative_to(above))
 
     def evaluate(self, wi: Vector, wo: Vector) -> tuple[Array, ...]:
         if self.is_smooth:

@@ -20,7 +20,7 @@ from layerjax._numerics import safe_div
 from layerjax.channels import Channels, pick
 from layerjax.directions import UNIT_SLACK, Vector, dot, horizontal, select, split
 from layerjax.stack import Interface, Stack
-from layerjax.surfaces import Conductor, Surface
+from layerjax.surfaces import Conductor
 from layerjax.transport.known_directions import DirectionLookup
 
 Side = Literal["all", "reflection", "transmission"]
@@ -290,13 +290,25 @@ class RandomTransport(Transport):
         return near.reshape(*batch, -1), far.reshape(*batch, -1)
 
 
-def refuse_film(base: Surface | None, transport: str) -> None:
-    """Raise a ValueError for a metal under a thin film, on behalf of a transport that takes metals from tables."""
-    if isinstance(base, Conductor) and base.film is not None:
+def refuse_film(stack: Stack, names: Sequence[str], transport: str) -> None:
+    """Raise a ValueError for a thin film, on behalf of a transport that takes interfaces and metals from tables."""
+    refuse_interface_film(stack, names, transport)
+    if isinstance(stack.base, Conductor) and stack.base.film is not None:
         raise ValueError(
             f"base.film: {transport} carries no ThinFilm; AddingDoubling, RandomWalk, SingleScattering, SpongeCake and "
             "WeidlichWilkie do"
         )
+
+
+def refuse_interface_film(stack: Stack, names: Sequence[str], transport: str, *, rough_only: bool = False) -> None:
+    """Raise a ValueError that names the first (rough) interface with a thin film, on behalf of a transport without
+    them."""
+    for name, layer in zip(names, stack.layers, strict=True):
+        if isinstance(layer, Interface) and layer.film is not None and not (rough_only and layer.is_smooth):
+            raise ValueError(
+                f"{name}.film: {transport} carries no ThinFilm on {'a rough' if rough_only else 'an'} Interface; "
+                "AddingDoubling and RandomWalk with facet_multiple_scattering=False do"
+            )
 
 
 def refuse_smooth(stack: Stack, names: Sequence[str], transport: str) -> None:

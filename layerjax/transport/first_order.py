@@ -23,22 +23,25 @@ from layerjax.normals.facets import Distribution, reflection_pdf, rule, sample
 from layerjax.normals.widths import Width
 from layerjax.quadrature import Nodes
 from layerjax.stack import Interface, Medium, Stack, optical_depths
-from layerjax.surfaces import Conductor, Surface
-from layerjax.surfaces.interface import interface_reflection, interface_transmission
+from layerjax.surfaces import Conductor, Surface, ThinFilm
+from layerjax.surfaces.interface import reflected_channels, transmitted_channels
+from layerjax.surfaces.thin_film import films_of
 from layerjax.transport.contract import Side
 from layerjax.transport.single_scattering import Media, SingleScattering
 from layerjax.transport.specular import Window, is_smooth, region_indices, smooth_window, windows
 
 
 class ReflectingInterface(Surface):
-    """Reflection at an interface, seen from its upper side. ior: index below over index above."""
+    """Reflection at an interface, seen from its upper side. ior: index below over index above; so are those of a film
+    counted."""
 
     ior: Parameter
     alpha: Width
     distribution: Distribution = eqx.field(static=True, default="ggx")
+    film: ThinFilm | None = None
 
     def evaluate(self, wi: Vector, wo: Vector) -> tuple[Array, ...]:
-        return (interface_reflection(wi, wo, self.ior, self.alpha, self.distribution),)
+        return reflected_channels(wi, wo, self.ior, self.alpha, self.distribution, films_of(self.film))
 
     def sample(self, wi: Vector, u1: Array, u2: Array) -> Vector:
         return reflect(wi, sample(wi, self.alpha, u1, u2, self.distribution))
@@ -122,10 +125,7 @@ def _smooth_order(stack: Stack) -> SmoothOrder:
 
 def _relative_stack(layers: Sequence[Any], base: Surface | None, above: Array) -> Stack:
     """A part of a stack, its indices counted from what lies above it."""
-    counted = tuple(
-        eqx.tree_at(lambda face: face.ior, layer, layer.ior / above) if isinstance(layer, Interface) else layer
-        for layer in layers
-    )
+    counted = tuple(layer.relative_to(above) if isinstance(layer, Interface) else layer for layer in layers)
     return Stack(counted, base.relative_to(above) if isinstance(base, Conductor) else base)
 
 
@@ -136,7 +136,8 @@ def _rough_order(stack: Stack) -> FirstOrder:
     first, last = interfaces[0], interfaces[-1]
     face = stack.layers[first]
     assert isinstance(face, Interface)
-    upper = Media(_media(stack.layers[:first]), ReflectingInterface(face.ior, face.width, face.distribution))
+    crossing = ReflectingInterface(face.ior, face.width, face.distribution, face.film)
+    upper = Media(_media(stack.layers[:first]), crossing)
     if stack.base is not None:
         return FirstOrder(upper, None, None, True, True)
     above: Any = 1.0
@@ -146,12 +147,12 @@ def _rough_order(stack: Stack) -> FirstOrder:
         above = before.ior
     bottom = stack.layers[last]
     assert isinstance(bottom, Interface)
+    film = None if bottom.film is None else bottom.film.relative_to(bottom.ior)
     lower = Media(
         tuple(map(_flip_medium, reversed(_media(stack.layers[last + 1 :])))),
-        ReflectingInterface(above / bottom.ior, bottom.width, bottom.distribution),
+        ReflectingInterface(above / bottom.ior, bottom.width, bottom.distribution, film),
     )
-    crossing = ReflectingInterface(face.ior, face.width, face.distribution) if first == last else None
-    return FirstOrder(upper, lower, crossing, False, True)
+    return FirstOrder(upper, lower, crossing if first == last else None, False, True)
 
 
 def evaluate_first(state: FirstOrder | SmoothOrder, wi: Vector, wo: Vector, side: Side) -> Channels:
@@ -240,10 +241,15 @@ def _refraction(state: FirstOrder, face: ReflectingInterface, wi: Vector, wo: Ve
     valid = (over[2] > edge) & (under[2] < -edge)
     over = sanitise(over, valid)
     under = (under[0], under[1], jnp.where(valid, under[2], -0.5))
-    value = interface_transmission(over, under, face.ior, face.alpha, face.distribution)
-    value = jnp.where(downward, value, value / (face.ior * face.ior))  # f / ior_o^2 is reciprocal
+    values = transmitted_channels(over, under, face.ior, face.alpha, face.distribution, films_of(face.film))
+    # f / ior_o^2 is reciprocal
+    values = tuple(jnp.where(downward, value, value / (face.ior * face.ior)) for value in values)
     depths = optical_depths(state.upper.media, over) + optical_depths(state.lower.media, flip(under))
-    return tuple(jnp.where(valid, value * jnp.exp(-depth), 0.0) for depth in total(depths, jnp.zeros_like(value)))
+    return map_channels(
+        lambda value, depth: jnp.where(valid, value * jnp.exp(-depth), 0.0),
+        values,
+        total(depths, jnp.zeros_like(values[0])),
+    )
 
 
 def _media(layers: tuple[Interface | Medium, ...]) -> tuple[Medium, ...]:

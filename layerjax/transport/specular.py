@@ -18,7 +18,8 @@ from layerjax._numerics import clamp_min, horizon, safe_div
 from layerjax.channels import Channels, map_channels, multiply
 from layerjax.directions import Vector, bend, flip, mirror, sanitise, select
 from layerjax.stack import Interface, Medium, Stack, optical_depths
-from layerjax.surfaces import Conductor, Surface
+from layerjax.surfaces import Conductor, Surface, ThinFilm
+from layerjax.surfaces.thin_film import films_of
 
 BELOW_ONE = 1.0 - 1e-6
 
@@ -26,11 +27,29 @@ LEAST_LOSS = 1e-18
 """The least share of light between two faces that is lost in a turn: total reflection on both sides stays finite."""
 
 
+class Face(eqx.Module):
+    """A smooth interface as light meets it: the indices before and behind, and the film on it."""
+
+    before: Array
+    behind: Array
+    film: ThinFilm | None
+
+    @property
+    def ratio(self) -> Array:
+        """Index behind over index before."""
+        return self.behind / self.before
+
+    def reflectance(self, cosine: Array, refracted: Array, transmits: Array) -> Channels:
+        """By the cosine of incidence, that of refraction, and whether there is such light."""
+        films = films_of(self.film, self.before)
+        return tuple(fresnel.dielectric_towards(cosine, self.ratio, refracted, transmits, film) for film in films)
+
+
 class Window(eqx.Module):
     """What a ray crosses on its way to a region, from the outside in: media, each in the index around it, and smooth
-    interfaces, by the indices before and behind."""
+    interfaces."""
 
-    parts: tuple[Medium | tuple[Array, Array], ...]
+    parts: tuple[Medium | Face, ...]
 
     def cross(self, w: Vector) -> tuple[Vector, Channels]:
         """The direction behind, and the share of energy that passes, in or out, of light along w outside.
@@ -45,10 +64,9 @@ class Window(eqx.Module):
                 (depth,) = optical_depths([part], here)
                 passed = multiply(passed, tuple(jnp.exp(-one) for one in depth))
                 continue
-            ratio = part[1] / part[0]
-            there, exists = bend(here, ratio)
-            reflected = fresnel.dielectric_towards(jnp.abs(here[2]), ratio, jnp.abs(there[2]), exists)
-            passed = multiply(passed, (1.0 - reflected,))
+            there, exists = bend(here, part.ratio)
+            reflected = part.reflectance(jnp.abs(here[2]), jnp.abs(there[2]), exists)
+            passed = multiply(passed, tuple(1.0 - level for level in reflected))
             here = (there[0], there[1], jnp.where(exists, there[2], jnp.where(w[2] < 0, -0.5, 0.5)))
         return here, passed
 
@@ -185,17 +203,19 @@ def ray_shares(
             reflected, passed = multiply(share, returned, reflected), multiply(share, passed)
         elif layer.is_smooth:
             cosine = jnp.where(here[1], jnp.abs(here[0][2]), 0.5)
-            level = fresnel.dielectric_towards(cosine, far / near, jnp.abs(there[0][2]), there[1])
-            reflected, passed = _behind_face(level, reflected, passed)
+            levels = Face(near, far, layer.film).reflectance(cosine, jnp.abs(there[0][2]), there[1])
+            reflected, passed = _behind_face(levels, reflected, passed)
         else:
             reflected, passed = zero, zero
     return reflected, passed
 
 
-def _behind_face(level: Array, reflected: Channels, passed: Channels) -> tuple[Channels, Channels]:
+def _behind_face(levels: Channels, reflected: Channels, passed: Channels) -> tuple[Channels, Channels]:
     """A smooth face of this reflectance on what reflects and passes these shares: all turns between the two."""
-    turns = tuple((1.0 - level) / clamp_min(1.0 - level * part, LEAST_LOSS) for part in reflected)
-    whole = map_channels(lambda part, turns: level + (1.0 - level) * turns * part, reflected, turns)
+    turns = map_channels(
+        lambda level, part: (1.0 - level) / clamp_min(1.0 - level * part, LEAST_LOSS), levels, reflected
+    )
+    whole = map_channels(lambda level, part, turns: level + (1.0 - level) * turns * part, levels, reflected, turns)
     return whole, multiply(turns, passed)
 
 
@@ -216,12 +236,13 @@ def windows(stack: Stack) -> list[tuple[int, int, Window | None, Window | None]]
 
 
 def _window(crossed: Sequence[Crossed], *, turned: bool) -> Window | None:
-    parts: list[Medium | tuple[Array, Array]] = []
+    parts: list[Medium | Face] = []
     for layer, above, below in crossed:
         if isinstance(layer, Medium):
             parts.append(layer)
         elif layer.is_smooth:
-            parts.append((below, above) if turned else (above, below))
+            before, behind = (below, above) if turned else (above, below)
+            parts.append(Face(before, behind, layer.film))
         else:
             return None
     return Window(tuple(parts))

@@ -35,7 +35,14 @@ from layerjax.directions import (
 from layerjax.normals.ggx import ggx_area, ggx_density
 from layerjax.stack import Medium, Stack, is_known, optical_depths
 from layerjax.surfaces import Conductor, Surface
-from layerjax.transport.contract import TEXELS, DeterministicTransport, Side, refuse_smooth, require_ggx
+from layerjax.transport.contract import (
+    TEXELS,
+    DeterministicTransport,
+    Side,
+    refuse_interface_film,
+    refuse_smooth,
+    require_ggx,
+)
 from layerjax.transport.first_order import ReflectingInterface
 from layerjax.transport.known_directions import DirectionLookup
 
@@ -56,6 +63,7 @@ class WeidlichWilkie(DeterministicTransport):
     def check(self, stack: Stack, names: Sequence[str]) -> None:
         refuse_smooth(stack, names, "WeidlichWilkie")
         require_ggx(stack, names, "WeidlichWilkie")
+        refuse_interface_film(stack, names, "WeidlichWilkie")
         for name, layer in zip(names, stack.layers, strict=True):
             if isinstance(layer, Medium) and not is_known(layer.albedo, 0.0):
                 raise ValueError(

@@ -77,7 +77,7 @@ WRONG = {
 NONE_IS_FINE = {
     ("Medium", "f0"), ("TurbidMedium", "f0"), ("Stack", "base"), ("evaluate", "key"), ("albedo", "key"),
     ("AddingDoubling", "nodes"), ("AddingDoubling", "modes"), ("AddingDoubling", "tolerance"), ("SGGX", "axis"),
-    ("Conductor", "film"), ("Conductor", "alpha"), ("Interface", "alpha"),
+    ("Conductor", "film"), ("Conductor", "alpha"), ("Interface", "alpha"), ("Interface", "film"),
 }  # fmt: skip
 """Arguments that may be left out."""
 

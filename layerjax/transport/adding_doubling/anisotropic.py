@@ -25,6 +25,7 @@ from layerjax.transport.adding_doubling.facet_scattering import (
     Normals,
     azimuth_count,
     blur_of_refraction,
+    film_from,
     polar_count,
     refract,
     smith_masking,
@@ -49,26 +50,37 @@ METAL_FACETS = (24, 48)
 
 
 def anisotropic_interface(
-    grid: Grid, above: Region, below: Region, normals: Normals, azimuths: int, *, enters: bool = True
+    grid: Grid,
+    above: Region,
+    below: Region,
+    normals: Normals,
+    azimuths: int,
+    *,
+    enters: bool = True,
+    film: fresnel.Film | None = None,
 ) -> Layer:
     """Interface of two widths between two regions, on ordinates.
 
-    enters: whether light from above counts as entering, see `interface_layer`.
+    enters: whether light from above counts as entering; film: see `interface_layer`.
     """
     near, far = (spread_over_azimuths(region, azimuths) for region in ((above, below) if enters else (below, above)))
     points = polar_count(grid), 2 * azimuth_count(grid, azimuths // 2 + 1)
     (outside, down), (inside, up) = (
-        _energies(one, other.ior / one.ior, normals, azimuths, points) for one, other in ((near, far), (far, near))
+        _energies(one, other.ior / one.ior, normals, azimuths, points, film_from(film, one))
+        for one, other in ((near, far), (far, near))
     )
     region = below if enters else above
     edges = blur_of_edges(grid, near, far, normals)
-    through = _deposit(grid, region, _rays(near, far.ior / near.ior, normals, azimuths, points), near, edges, azimuths)
+    rays = _rays(near, far.ior / near.ior, normals, azimuths, points, film_from(film, near))
+    through = _deposit(grid, region, rays, near, edges, azimuths)
     through = balance_flux(through, near, far, *reconcile_energies(near, far, (down, up), (outside, inside)))
     rest_near = jnp.where(near.weight > 0, down - jnp.sum(through[0], axis=-2), 0.0)
     rest_far = jnp.where(far.weight > 0, up - safe_div(through[0] @ near.weight, far.weight), 0.0)
     share = unsampled_share(grid, normals)
-    outer = _reflection(near, outside, rest_near, share, far.ior / near.ior, normals, azimuths)
-    inner = _reflection(far, inside, rest_far, share, near.ior / far.ior, normals, azimuths)
+    outer, inner = (
+        _reflection(one, level, rest, share, other.ior / one.ior, normals, azimuths, film_from(film, one))
+        for one, other, level, rest in ((near, far, outside, rest_near), (far, near, inside, rest_far))
+    )
     parts = [Parts(operator[None]) for operator in (outer, through, adjoint(through, near.weight, far), inner)]
     outer_part, into, out, inner_part = parts
     return Layer(outer_part, inner_part, into, out) if enters else Layer(inner_part, outer_part, out, into)
@@ -141,40 +153,44 @@ def _map_facets(
 
 
 def _energies(
-    flat: Region, ratio: Array, normals: Normals, azimuths: int, points: tuple[int, int]
+    flat: Region, ratio: Array, normals: Normals, azimuths: int, points: tuple[int, int], film: fresnel.Film | None
 ) -> tuple[Array, Array]:
     """Of light from every node: what facets reflect, and what they refract."""
 
     def energies(wi: Vector, m: Vector, share: Array) -> tuple[Array, Array]:
         facing = dot(wi, m)
-        level = fresnel.dielectric(facing, ratio) * smith_masking(reflect(wi, m), normals)
-        return jnp.sum(share * level, axis=-1), jnp.sum(refract(wi, m, facing, share, ratio, normals)[1], axis=-1)
+        level = fresnel.dielectric(facing, ratio, film=film) * smith_masking(reflect(wi, m), normals)
+        _, passed = refract(wi, m, facing, share, ratio, normals, film=film)
+        return jnp.sum(share * level, axis=-1), jnp.sum(passed, axis=-1)
 
     reflected, refracted = _map_facets(energies, flat, normals, azimuths, points)
     return reflected, clamp_max(refracted, 1.0 - reflected)
 
 
 def _rays(
-    flat: Region, ratio: Array, normals: Normals, azimuths: int, points: tuple[int, int]
+    flat: Region, ratio: Array, normals: Normals, azimuths: int, points: tuple[int, int], film: fresnel.Film | None
 ) -> Callable[[Callable[[Vector, Array], Array]], Array]:
     """Maps a function of refracted rays and their shares, (nodes, points), over all nodes."""
 
     def mapped(function: Callable[[Vector, Array], Array]) -> Array:
         def of_facets(wi: Vector, m: Vector, share: Array) -> Array:
             blur = blur_of_refraction(points[0], ratio, normals)
-            return function(*refract(wi, m, dot(wi, m), share, ratio, normals, blur))
+            return function(*refract(wi, m, dot(wi, m), share, ratio, normals, blur, film))
 
         return _map_facets(of_facets, flat, normals, azimuths, points)
 
     return mapped
 
 
-def refracted_energy(w: Vector, ratio: Array, normals: Normals, points: tuple[int, int]) -> Array:
-    """Of light along each direction w above the horizon: what facets of two widths refract."""
+def refracted_energy(
+    w: Vector, ratio: Array, normals: Normals, points: tuple[int, int], film: fresnel.Film | None = None
+) -> Array:
+    """Of light along each direction w above the horizon: what facets of two widths refract; film: as seen from w."""
     assert isinstance(normals.alpha, Widths)
     m, share = visible_grid(w, normals.alpha, normals.distribution, points)
     wi: Vector = (w[0][..., None], w[1][..., None], w[2][..., None])
-    return jnp.sum(refract(wi, m, dot(wi, m), jnp.asarray(share, w[2].dtype), ratio, normals)[1], axis=-1)
+    _, passed = refract(wi, m, dot(wi, m), jnp.asarray(share, w[2].dtype), ratio, normals, film=film)
+    return jnp.sum(passed, axis=-1)
 
 
 def _deposit(
@@ -215,7 +231,14 @@ def _deposit(
 
 
 def _reflection(
-    flat: Region, level: Array, rest: Array, share: Array, ior: Array, normals: Normals, azimuths: int
+    flat: Region,
+    level: Array,
+    rest: Array,
+    share: Array,
+    ior: Array,
+    normals: Normals,
+    azimuths: int,
+    film: fresnel.Film | None,
 ) -> Array:
     """Reflection on one side, with the rest that nodes let pass too little or too much; see `interfaces`."""
     most = largest_correction(level)
@@ -225,6 +248,6 @@ def _reflection(
     h, cosine = half_vector(wi, wo, same_side=True)
     along, across = wi[0] * wo[0] + wi[1] * wo[1], wi[0] * wo[1] - wi[1] * wo[0]
     blur = critical_blur(along, across, wi[2] * wo[2], ior, 2.0 * np.pi / azimuths, 0.0)
-    kernel = fresnel.dielectric(cosine, ior, blur) * mirror_lobe(h, wi, wo, *normals)
+    kernel = fresnel.dielectric(cosine, ior, blur, film) * mirror_lobe(h, wi, wo, *normals)
     lobe = scale_to_energy(flat, kernel[None], jnp.where(flat.exists, energy, 0.0))
     return lobe + share * jnp.diag(clamp_min(rest, -level))

@@ -14,12 +14,14 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from layerjax import fresnel
 from layerjax._batching import map_row_chunks
 from layerjax._numerics import horizon, safe_sqrt, smooth_step
-from layerjax.channels import Channels, map_channels, total
+from layerjax.channels import Channels, count, map_channels, per_channel, pick, total
 from layerjax.directions import Vector, flip, sanitise, select
 from layerjax.stack import Interface, Medium, Stack, optical_depths
 from layerjax.surfaces.interface import continued_transmission, is_index_matched
+from layerjax.surfaces.thin_film import BARE, films_of
 from layerjax.transport.adding_doubling.facet_scattering import Normals, facet_spacing, refracted_rays
 from layerjax.transport.adding_doubling.operators import (
     Layer,
@@ -154,6 +156,25 @@ def evaluate_ballistic(state: Ballistic, wi: Vector, wo: Vector) -> Channels:
 
 
 def _transmitted_bsdf(state: Ballistic, cosine_i: Array, cosine_o: Array, azimuth: Array) -> Channels:
+    """BSDF of pairs, see `_film_transmitted`; once for each channel that films tell apart."""
+    films = [films_of(face.film) for face in (state.upper, state.lower)]
+    if films == [BARE, BARE]:
+        return _film_transmitted(state, (None, None), cosine_i, cosine_o, azimuth)
+    channels = max(count(*films), *(count(per_channel(medium.thickness)) for medium in state.media[1]), 1)
+    found = []
+    for c in range(channels):
+        values = _film_transmitted(state, (pick(films[0], c), pick(films[1], c)), cosine_i, cosine_o, azimuth)
+        found.append(pick(values, c))
+    return tuple(found)
+
+
+def _film_transmitted(
+    state: Ballistic,
+    films: tuple[fresnel.Film | None, fresnel.Film | None],
+    cosine_i: Array,
+    cosine_o: Array,
+    azimuth: Array,
+) -> Channels:
     """f from above to below for light along (-sin, 0, cos) that leaves turned by an azimuth: arrays (pairs,) each.
 
     With m between, g_i and g_o the BTDFs from m out along either direction, f = n^2 * integral of g_i g_o cos(m). Rays
@@ -167,6 +188,7 @@ def _transmitted_bsdf(state: Ballistic, cosine_i: Array, cosine_o: Array, azimut
     under: Vector = (sine_o[:, None] * cos_phi, sine_o[:, None] * sin_phi, -cosine_o[:, None])
 
     ratios = 1.0 / inner, below / inner
+    of_inner = [None if film is None else film.seen_from(inner) for film in films]
     edges = [
         EDGE * facet_spacing(POINTS[0], facets) * jnp.abs(1.0 - n) for n, facets in zip(ratios, faces, strict=True)
     ]
@@ -174,18 +196,19 @@ def _transmitted_bsdf(state: Ballistic, cosine_i: Array, cosine_o: Array, azimut
     def parts(x: Array, y: Array, z: Array) -> tuple[BTDFLobe, BTDFLobe, Channels]:
         """g_i, g_o / n_below^2 and what media pass, of travel along (x, y, -z) between the interfaces."""
         middle: Vector = (-x, -y, z)
-        g_i = _lobe((x, y, z), over, ratios[0], faces[0], edges[1])
-        g_o = _lobe(middle, under, ratios[1], faces[1], edges[0])
+        g_i = _lobe((x, y, z), over, ratios[0], faces[0], edges[1], of_inner[0])
+        g_o = _lobe(middle, under, ratios[1], faces[1], edges[0], of_inner[1])
         depths = total([*optical_depths(state.media[1], middle), (jnp.zeros_like(z),)])
         return g_i, BTDFLobe(*(part / below**2 for part in g_o)), tuple(jnp.exp(-depth) for depth in depths)
 
     # a BTDF at equal indices is a delta: then the rays of that side are the whole
     delta_i, delta_o = is_index_matched(inner), is_index_matched(inner / below)
-    (x, y, z), share = _rays(cosine_i, inner, faces[0])
+    (x, y, z), share = _rays(cosine_i, inner, faces[0], films[0])
     g_i, g_o, passed = parts(x, y, z)
     counted = jnp.where(delta_i, 1.0, jnp.where(delta_o, 0.0, _weight(g_i, g_o)))
     from_above = [jnp.sum(share * below**2 * g_o.ended * counted * level, axis=-1) for level in passed]
-    (x, y, z), share = _rays(cosine_o, inner / below, faces[1])
+    from_outside = None if films[1] is None else films[1].seen_from(below)
+    (x, y, z), share = _rays(cosine_o, inner / below, faces[1], from_outside)
     # followed backwards, from where it leaves
     g_i, g_o, passed = parts(x * cos_phi - y * sin_phi, x * sin_phi + y * cos_phi, z)
     counted = jnp.where(delta_i, 0.0, jnp.where(delta_o, 1.0, _weight(g_o, g_i)))
@@ -193,8 +216,8 @@ def _transmitted_bsdf(state: Ballistic, cosine_i: Array, cosine_o: Array, azimut
     return total([from_above, from_below])
 
 
-def _lobe(wi: Vector, wo: Vector, ratio: Array, facets: Normals, edge: Array) -> BTDFLobe:
-    value, height = continued_transmission(wi, wo, ratio, *facets)
+def _lobe(wi: Vector, wo: Vector, ratio: Array, facets: Normals, edge: Array, film: fresnel.Film | None) -> BTDFLobe:
+    (value,), height = continued_transmission(wi, wo, ratio, *facets, (film,))
     return BTDFLobe(value, value * smooth_step(height / (edge + TINY)))
 
 
@@ -202,9 +225,9 @@ def _weight(one: BTDFLobe, other: BTDFLobe) -> Array:
     return one.continued / (one.continued + other.continued + TINY)
 
 
-def _rays(cosine: Array, ratio: Array, normals: Normals) -> tuple[Vector, Array]:
+def _rays(cosine: Array, ratio: Array, normals: Normals, film: fresnel.Film | None) -> tuple[Vector, Array]:
     """Where facets refract light along (-sin, 0, cos) to, z counted on the far side, and its shares."""
-    rays, share = refracted_rays(requested_region(cosine, jnp.ones_like(ratio)), ratio, normals, POINTS)
+    rays, share = refracted_rays(requested_region(cosine, jnp.ones_like(ratio)), ratio, normals, POINTS, film)
     x, y, z = sanitise(rays, rays[2] > 0)  # of rays back up, whose share is 0, masking has no meaning
 
     def both(part: Array, mirrored: Array) -> Array:  # shares stand for mirror images too

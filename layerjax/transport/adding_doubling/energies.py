@@ -12,11 +12,13 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jax import Array
 
+from layerjax import fresnel
 from layerjax._numerics import clamp_max, clamp_min, clamp_nonnegative, horizon
 from layerjax.channels import Channels, map_channels, multiply, select, total
 from layerjax.directions import Vector, flip, sanitise
 from layerjax.normals.widths import Widths
 from layerjax.stack import Interface, Stack
+from layerjax.surfaces.thin_film import films_of
 from layerjax.transport.adding_doubling.anisotropic import refracted_energy
 from layerjax.transport.adding_doubling.facet_scattering import Normals, refracted_rays
 from layerjax.transport.adding_doubling.operators import Layer, Operator, Parts
@@ -106,7 +108,7 @@ def directional_albedo(
     faces = [(media, w) for media, w in sides if isinstance(media, Media)]
     zero = jnp.zeros_like(wi[2])
     once = total([single.albedo(media, w, nodes)[0] for media, w in faces], zero)
-    lost = total([(_masking_loss(media, w, once[0], nodes),) for media, w in faces], zero)
+    lost = total([_masking_loss(media, w, once, nodes) for media, w in faces], zero)
     near, far = clip_negative(*shares[1:])
     stays = map_channels(
         lambda once, lost, out: clamp_max(clamp_min(lost * out, 0.0), clamp_min(1.0 - once, 0.0)), once, lost, shares[0]
@@ -123,20 +125,27 @@ def directional_albedo(
     return select(visible, total(parts)), select(visible, multiply(inside, far))
 
 
-def _masking_loss(media: Media, w: Vector, reflected: Array, nodes: int) -> Array:
+def _masking_loss(media: Media, w: Vector, reflected: Channels, nodes: int) -> Channels:
     """Energy that masking takes at a face which is the first that light along w meets; else 0."""
     face = media.base
     if media.media or not isinstance(face, ReflectingInterface):
-        return jnp.zeros_like(w[2])
+        return (jnp.zeros_like(w[2]),)
     above = w[2] > horizon(w[2].dtype)
     normals = Normals(face.alpha, face.distribution)
-    if isinstance(face.alpha, Widths):
-        refracted = refracted_energy(sanitise(w, above), face.ior, normals, (nodes, 2 * nodes))
-    else:
+
+    def refracted(film: fresnel.Film | None) -> Array:
+        if isinstance(face.alpha, Widths):
+            return refracted_energy(sanitise(w, above), face.ior, normals, (nodes, 2 * nodes), film)
         region = requested_region(jnp.where(above, w[2], 0.5).ravel(), jnp.ones_like(face.ior))
-        _, passed = refracted_rays(region, face.ior, normals, (nodes, max(2, nodes // 2)))
-        refracted = jnp.sum(passed, axis=-1).reshape(w[2].shape)
-    return jnp.where(above, clamp_min(1.0 - reflected - refracted, 0.0), 0.0)
+        _, passed = refracted_rays(region, face.ior, normals, (nodes, max(2, nodes // 2)), film)
+        return jnp.sum(passed, axis=-1).reshape(w[2].shape)
+
+    films = films_of(face.film)
+    return map_channels(
+        lambda reflected, passed: jnp.where(above, clamp_min(1.0 - reflected - passed, 0.0), 0.0),
+        reflected[: len(films)],
+        tuple(map(refracted, films)),
+    )
 
 
 def clip_negative(near: Channels, far: Channels) -> tuple[Channels, Channels]:

@@ -39,28 +39,43 @@ class Normals(NamedTuple):
     distribution: facets.Distribution
 
 
-def facet_energies(near: Region, far: Region, normals: Normals) -> tuple[Array, Array, Array]:
-    """Of light from every near node: the energy that facets reflect, that they refract, and that masking takes."""
-    reflected = reflected_energy(near, far.ior / near.ior, normals)
-    _, passed = refracted_rays(near, far.ior / near.ior, normals, ENERGY_POINTS)
+def film_from(film: fresnel.Film | None, region: Region) -> fresnel.Film | None:
+    """A film that is counted in the surroundings of the stack, as it is seen from a region."""
+    return None if film is None else film.seen_from(region.ior)
+
+
+def facet_energies(
+    near: Region, far: Region, normals: Normals, film: fresnel.Film | None = None
+) -> tuple[Array, Array, Array]:
+    """Of light from every near node: the energy that facets reflect, that they refract, and that masking takes.
+
+    film: on the facets, counted in the surroundings of the stack.
+    """
+    seen = film_from(film, near)
+    reflected = reflected_energy(near, far.ior / near.ior, normals, seen)
+    _, passed = refracted_rays(near, far.ior / near.ior, normals, ENERGY_POINTS, seen)
     # by quadrature it may be a little more than there is
     refracted = clamp_max(jnp.sum(passed, axis=-1), 1.0 - reflected)
     return reflected, refracted, jnp.where(near.exists, 1.0 - reflected - refracted, 0.0)
 
 
-def reflected_energy(region: Region, ratio: Array, normals: Normals) -> Array:
+def reflected_energy(region: Region, ratio: Array, normals: Normals, film: fresnel.Film | None = None) -> Array:
+    """Of light from every node: what facets reflect; film: as seen from there."""
+
     def energy(m: Vector, facing: Array, weight: Array, wi: Vector) -> Array:
-        level = fresnel.dielectric(facing, ratio) * smith_masking(reflect(wi, m), normals)
+        level = fresnel.dielectric(facing, ratio, film=film) * smith_masking(reflect(wi, m), normals)
         return jnp.sum(weight * level, axis=-1)
 
     return map_visible_normals(energy, region, normals, ratio, "reflected", ENERGY_POINTS)
 
 
-def refracted_rays(region: Region, ratio: Array, normals: Normals, points: tuple[int, int]) -> tuple[Vector, Array]:
-    """Of light from every node: where facets refract it to, and how much."""
+def refracted_rays(
+    region: Region, ratio: Array, normals: Normals, points: tuple[int, int], film: fresnel.Film | None = None
+) -> tuple[Vector, Array]:
+    """Of light from every node: where facets refract it to, and how much; film: as seen from there."""
 
     def rays(m: Vector, facing: Array, weight: Array, wi: Vector) -> tuple[Vector, Array]:
-        return refract(wi, m, facing, weight, ratio, normals)
+        return refract(wi, m, facing, weight, ratio, normals, film=film)
 
     return map_visible_normals(rays, region, normals, ratio, "refracted", points)
 
@@ -96,14 +111,21 @@ def _denser(points: tuple[int, int]) -> tuple[int, int]:
 
 
 def refract(
-    wi: Vector, m: Vector, facing: Array, weight: Array, ratio: Array, normals: Normals, blur: Array | None = None
+    wi: Vector,
+    m: Vector,
+    facing: Array,
+    weight: Array,
+    ratio: Array,
+    normals: Normals,
+    blur: Array | None = None,
+    film: fresnel.Film | None = None,
 ) -> tuple[Vector, Array]:
     """Where facets refract light to, z counted on the far side, and how much: nothing under total reflection.
 
-    blur: see `fresnel.dielectric`.
+    blur, film: see `fresnel.dielectric`.
     """
     refracted, exists = fresnel.cosine_of_refraction(facing, ratio, blur)
-    level = fresnel.dielectric_towards(facing, ratio, refracted, exists)
+    level = fresnel.dielectric_towards(facing, ratio, refracted, exists, film)
     down = combine(facing / ratio - refracted, m, -1.0 / ratio, wi)
     if blur is not None:
         down = normalize(down)
@@ -116,15 +138,19 @@ def refract(
     return wo, jnp.where(exists, weight * (1.0 - level) * smith_masking(wo, normals), 0.0)
 
 
-def dense_refracted_rays(grid: Grid, near: Region, far: Region, normals: Normals, modes: int) -> tuple[Vector, Array]:
-    """Of light from every near node, by facets: where to and how much is refracted."""
-    ratio = far.ior / near.ior
+def dense_refracted_rays(
+    grid: Grid, near: Region, far: Region, normals: Normals, modes: int, film: fresnel.Film | None = None
+) -> tuple[Vector, Array]:
+    """Of light from every near node, by facets: where to and how much is refracted; film: see `facet_energies`."""
+    ratio, seen = far.ior / near.ior, film_from(film, near)
     if normals.distribution != "ggx":
         # about the direction, not the normal: what a mirror sends back through them asks for more than their own caps
-        return refracted_rays(near, ratio, normals, (3 * polar_count(grid) // 2, 3 * azimuth_count(grid, modes) // 2))
+        points = 3 * polar_count(grid) // 2, 3 * azimuth_count(grid, modes) // 2
+        return refracted_rays(near, ratio, normals, points, seen)
     assert not isinstance(normals.alpha, Widths | Tailed)
     m, weight, wi = _ggx_normals(grid, near, normals.alpha, modes)
-    return refract(wi, m, dot(wi, m), weight, ratio, normals, blur_of_refraction(polar_count(grid), ratio, normals))
+    blur = blur_of_refraction(polar_count(grid), ratio, normals)
+    return refract(wi, m, dot(wi, m), weight, ratio, normals, blur, seen)
 
 
 def blur_of_refraction(points: int, ratio: Array, normals: Normals) -> Array:

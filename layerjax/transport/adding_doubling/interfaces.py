@@ -26,6 +26,7 @@ from layerjax.transport.adding_doubling.facet_scattering import (
     dense_refracted_rays,
     facet_energies,
     facet_spacing,
+    film_from,
     polar_count,
     reflected_energy,
     refracted_rays,
@@ -88,6 +89,7 @@ def interface_layer(
     enters: bool = True,
     requested: Region | None = None,
     next_event: NextEvent,
+    film: fresnel.Film | None = None,
 ) -> Layer:
     """Rough dielectric interface between two regions, as Fourier modes (Walter 2007).
 
@@ -100,12 +102,13 @@ def interface_layer(
             that comes from them, and per projected solid angle over 2 pi for light that leaves along them; what the
             interface reflects outside is omitted.
         next_event: what light that enters meets next.
+        film: on the interface, counted in the surroundings of the stack.
     """
     near, far = (above, below) if enters else (below, above)
     if requested is None:
-        operators = _operators(grid, near, far, normals, modes, multiple, next_event)
+        operators = _operators(grid, near, far, normals, modes, multiple, next_event, film)
     elif not multiple:
-        operators = _requested_operators(grid, requested, far, normals, modes, next_event)
+        operators = _requested_operators(grid, requested, far, normals, modes, next_event, film)
     else:  # what masking loses is returned in proportion to sums over all directions outside
         operators = _operators(
             grid,
@@ -115,17 +118,20 @@ def interface_layer(
             modes,
             multiple,
             next_event,
+            film,
             requested.weight.size,
         )
     outer, into, out, inner = (_add_channel_axis(parts) for parts in operators)
     return Layer(outer, inner, into, out) if enters else Layer(inner, outer, out, into)
 
 
-def smooth_layer(above: Region, below: Region) -> Layer:
-    """Smooth dielectric interface between two regions, whose nodes it refracts to each other."""
+def smooth_layer(above: Region, below: Region, film: fresnel.Film | None = None) -> Layer:
+    """Smooth dielectric interface between two regions, whose nodes it refracts to each other; film: see
+    `interface_layer`."""
     dtype = above.cosine.dtype
     crosses = above.exists & below.exists
-    level = fresnel.dielectric_towards(above.cosine, below.ior / above.ior, below.cosine, crosses)
+    ratio, seen = below.ior / above.ior, film_from(film, above)
+    level = fresnel.dielectric_towards(above.cosine, ratio, below.cosine, crosses, seen)
     # light that two faces reflect totally would go back and forth for ever: a little is lost
     mirrored = clamp_max(level, 1.0 - LEAK * float(jnp.finfo(dtype).eps))[None, None]
     passed = jnp.where(crosses, 1.0 - level, 0.0)[None, None]
@@ -144,18 +150,19 @@ def _operators(
     modes: int,
     multiple: bool,
     next_event: NextEvent,
+    film: fresnel.Film | None = None,
     requested: int = 0,
 ) -> list[Parts]:
     """Reflection outside, light that enters, light that leaves, reflection inside: of the first `requested`, or of all.
 
     What is returned after it was lost to masking has met several facets: it is no path of one event.
     """
-    outside, down, lost_outside = facet_energies(near, far, normals)
-    inside, up, lost_inside = facet_energies(far, near, normals)
+    outside, down, lost_outside = facet_energies(near, far, normals, film)
+    inside, up, lost_inside = facet_energies(far, near, normals, film)
     share = unsampled_share(grid, normals)
     through = _deposit(
         grid,
-        *dense_refracted_rays(grid, near, far, normals, modes),
+        *dense_refracted_rays(grid, near, far, normals, modes, film),
         far,
         near,
         modes,
@@ -166,9 +173,10 @@ def _operators(
     outer = None
     if not requested:
         rest = jnp.where(near.weight > 0, down - jnp.sum(through[0], axis=-2), 0.0)
-        outer = _reflection(near, outside, rest, share, far.ior / near.ior, normals, modes)
+        outer = _reflection(near, outside, rest, share, far.ior / near.ior, normals, modes, film_from(film, near))
     rest = jnp.where(far.weight > 0, up - safe_div(through[0] @ near.weight, far.weight), 0.0)
-    inner = _reflection(far, inside, rest, share, near.ior / far.ior, normals, modes, _trapped_blur(grid, next_event))
+    seen, blur = film_from(film, far), _trapped_blur(grid, next_event)
+    inner = _reflection(far, inside, rest, share, near.ior / far.ior, normals, modes, seen, blur)
     once: list[Array | None] = [outer, through, adjoint(through, leaving, far), inner]
     compensation: list[Array | None] = [None] * 4
     if multiple:
@@ -191,7 +199,13 @@ def _select_requested(parts: Parts, place: int, requested: int) -> Parts:
 
 
 def _requested_operators(
-    grid: Grid, requested: Region, inner: Region, normals: Normals, modes: int, next_event: NextEvent
+    grid: Grid,
+    requested: Region,
+    inner: Region,
+    normals: Normals,
+    modes: int,
+    next_event: NextEvent,
+    film: fresnel.Film | None,
 ) -> list[Parts]:
     """The four operators (see `_operators`) for requested directions, where what masking loses is lost: no sum over
     directions outside is needed."""
@@ -199,13 +213,14 @@ def _requested_operators(
     if next_event == "diffuse":  # only smooth functions are summed over what is let in
         least = LEAST_POINTS[normals.distribution]
         points = max(least[0], grid.nodes), max(least[1], modes // 2)
-        rays = refracted_rays(requested, ratio, normals, points)
+        rays = refracted_rays(requested, ratio, normals, points, film_from(film, requested))
     else:
-        rays = dense_refracted_rays(grid, requested, inner, normals, modes)
+        rays = dense_refracted_rays(grid, requested, inner, normals, modes, film)
     through = _deposit(grid, *rays, inner, requested, modes, blur_of_edges(grid, requested, inner, normals))
-    inside = reflected_energy(inner, 1.0 / ratio, normals)
+    seen = film_from(film, inner)
+    inside = reflected_energy(inner, 1.0 / ratio, normals, seen)
     back = adjoint(through, jnp.ones_like(requested.weight), inner)
-    face = _face(inner, inside, 1.0 / ratio, normals, modes, _trapped_blur(grid, next_event))
+    face = _face(inner, inside, 1.0 / ratio, normals, modes, seen, _trapped_blur(grid, next_event))
     return [Parts(operator) for operator in (None, through, back, face)]
 
 
@@ -227,8 +242,16 @@ def blur_of_edges(grid: Grid, near: Region, far: Region, normals: Normals) -> Ar
     return BLUR_BETWEEN * apart * jnp.abs(1.0 - near.ior / far.ior) * steepness
 
 
-def _face(region: Region, energy: Array, ior: Array, normals: Normals, modes: int, trapped_blur: float = 0.0) -> Array:
-    """Reflection at an interface, seen from one side; trapped_blur: see `_trapped_blur`.
+def _face(
+    region: Region,
+    energy: Array,
+    ior: Array,
+    normals: Normals,
+    modes: int,
+    film: fresnel.Film | None = None,
+    trapped_blur: float = 0.0,
+) -> Array:
+    """Reflection at an interface, seen from one side, and so is the film; trapped_blur: see `_trapped_blur`.
 
     Light that two interfaces reflect totally would go back and forth for ever: a little is lost.
     """
@@ -236,7 +259,8 @@ def _face(region: Region, energy: Array, ior: Array, normals: Normals, modes: in
 
     def reflection(wi: Vector, wo: Vector) -> list[Array]:
         h, cosine = half_vector(wi, wo, same_side=True)
-        level = fresnel.dielectric(cosine, ior, _critical_blur(wi, wo, ior, np.pi / azimuths(modes), trapped_blur))
+        blur = _critical_blur(wi, wo, ior, np.pi / azimuths(modes), trapped_blur)
+        level = fresnel.dielectric(cosine, ior, blur, film)
         return [level * mirror_lobe(h, wi, wo, *normals)]
 
     return scale_to_energy(region, modes_at_nodes(reflection, region, region, modes, has_mirror_lobe=True)[0], energy)
@@ -353,6 +377,7 @@ def _reflection(
     ior: Array,
     normals: Normals,
     modes: int,
+    film: fresnel.Film | None = None,
     trapped_blur: float = 0.0,
 ) -> Array:
     """Reflection on one side, with the rest that nodes let pass too little or too much: none of it is lost.
@@ -362,7 +387,7 @@ def _reflection(
     """
     most = largest_correction(level)
     resolved = (1.0 - share) * clamp_max(clamp_min(rest, -most), most)
-    lobe = _face(region, level + resolved, ior, normals, modes, trapped_blur)
+    lobe = _face(region, level + resolved, ior, normals, modes, film, trapped_blur)
     return lobe + share * jnp.diag(clamp_min(rest, -level))
 
 

@@ -80,6 +80,13 @@ whose edge no panel follows. A slab of index 1.4, alpha 0.3 and thickness 0.1: 1
 index 1.26 to 1.9: 12, up to 2e-2, 24, 3e-3, 32, 2e-3. Towards a higher index 8 nodes leave 1e-6.
 """
 
+FRINGES = 0.4
+"""Nodes needed for each radian by which the phase of light in a film on an interface changes with the angle.
+
+Measured over paint, index 1.5: a film of index 1.6, 2 um thick, at 500 nm (26 radians), 8 nodes, 5e-4; 3 um at 465 nm
+(42 radians), 12 nodes, 2e-3, 24, 2e-5.
+"""
+
 COSINES, COSINES_UNDER = 5.0, 3.2
 """Needed where azimuths are ordinates too, times the width of the narrowest lobe, bare and behind an interface.
 
@@ -186,6 +193,8 @@ def _requirement(stack: Stack, directions_known: bool, assumed: float = ASSUMED_
         cosines = max(cosines, (COSINES if index is None else COSINES_UNDER) / width)
     for least in _peak_nodes(stack, assumed):
         nodes, modes = max(nodes, least), max(modes, MODES_OF_PEAKS * least)
+    fringes = max(_film_nodes(stack), default=0.0)
+    nodes, cosines = max(nodes, fringes), max(cosines, fringes)
     return Requirement(max(nodes, NODES_INSIDE) if _traps_light(stack) else nodes, modes, cosines)
 
 
@@ -233,6 +242,26 @@ def _peak_nodes(stack: Stack, assumed: float) -> Iterator[float]:
             backward = _least(layer.phase.width, assumed)
             if within and backward < 1.0 and layer.phase.moments(1) is not None:
                 yield BACKWARD_WITHIN / math.hypot(backward, blur)
+
+
+def _film_nodes(stack: Stack) -> Iterator[float]:
+    """Nodes that the fringes of films on interfaces need, as far as their numbers are known while tracing."""
+    above = 1.0
+    for layer in stack.layers:
+        if not isinstance(layer, Interface):
+            continue
+        below = _least(layer.ior, ASSUMED_INDEX)
+        film, index = layer.film, max(1.0, above, below)
+        above = below
+        numbers = (
+            [None] * 3 if film is None else [*map(concrete_values, (film.ior, film.thickness_nm, film.wavelengths_nm))]
+        )
+        if any(number is None for number in numbers):
+            continue
+        iors, thicknesses, wavelengths = (np.asarray(number) for number in numbers)
+        ior = float(np.clip(index, np.min(iors), np.max(iors)))  # at which the phase changes most
+        phase = 2.0 * math.pi * float(np.max(thicknesses)) / float(np.min(wavelengths))
+        yield FRINGES * phase * (ior - math.sqrt(max(0.0, ior * ior - index * index)))
 
 
 def _traps_light(stack: Stack) -> bool:

@@ -15,11 +15,13 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from layerjax import fresnel
 from layerjax._parameters import cast_arrays
 from layerjax.normals.facets import Distribution
 from layerjax.normals.widths import OneWidth, Widths, cast_width, narrowest
 from layerjax.stack import Interface, Medium, Stack
 from layerjax.surfaces import Conductor, Lambertian, Surface
+from layerjax.surfaces.thin_film import films_of
 from layerjax.transport.adding_doubling.anisotropic import anisotropic_interface, anisotropic_metal
 from layerjax.transport.adding_doubling.ballistic import subtract_ballistic
 from layerjax.transport.adding_doubling.bases import base_layer
@@ -170,25 +172,30 @@ def _interfaces(
     if stack.base is None and len(interfaces) > 1:
         next_event = "faces"
     dtype = indices[0].dtype
+
+    def join(layer: Interface, function: Any, options: Any, numbers: Any, along: Any, step: Any = None) -> Layer:
+        """An element for each channel that a film tells apart, joined along the axis of the channels."""
+        films = films_of(layer.film)
+        found = [make(function, options, (*numbers, film), along, dtype, step) for film in films]
+        return found[0] if len(found) == 1 else jax.tree.map(lambda *parts: jnp.concatenate(parts), *found)
+
     layers: dict[int, Layer] = {}
     by_kind: dict[tuple[Distribution, bool], list[int]] = defaultdict(list)
     for region, layer in enumerate(interfaces):
         if layer.is_smooth:
-            layers[region] = make(_smooth_interface, (plan, region), indices, None, dtype)
+            layers[region] = join(layer, _smooth_interface, (plan, region), (indices,), None)
             continue
         leaves = stack.base is None and 1 < region + 1 == len(interfaces)
         if requested is not None and (layer is stack.layers[0] or leaves):
             options = plan, layer.distribution, not leaves, next_event, region
             along = requested.below if leaves else requested.above
-            layers[region] = make(_interface, options, (indices, layer.width), along, dtype, _interface_step)
+            layers[region] = join(layer, _interface, options, (indices, layer.width), along, _interface_step)
         elif layer.is_anisotropic:
-            layers[region] = make(
-                _anisotropic_interface,
-                (plan, layer.distribution, not leaves, region),
-                (indices, layer.width),
-                None,
-                dtype,
-            )
+            face = plan, layer.distribution, not leaves, region
+            layers[region] = join(layer, _anisotropic_interface, face, (indices, layer.width), None)
+        elif layer.film is not None:
+            options = plan, layer.distribution, not leaves, next_event, region
+            layers[region] = join(layer, _interface, options, (indices, layer.width), None, _interface_step)
         else:
             by_kind[layer.distribution, not leaves].append(region)
     for kind, regions in by_kind.items():
@@ -196,11 +203,11 @@ def _interfaces(
         if len(regions) < MANY:
             for region, width in zip(regions, widths, strict=True):
                 options = plan, *kind, next_event, region
-                layers[region] = make(_interface, options, (indices, width), None, dtype, _interface_step)
+                layers[region] = make(_interface, options, (indices, width, None), None, dtype, _interface_step)
         else:
             build = partial(_numbered_interface, plan, *kind, next_event)
             together = jax.lax.map(
-                lambda each, build=build: element(build, (indices, each[1]), each[0], dtype),
+                lambda each, build=build: element(build, (indices, each[1], None), each[0], dtype),
                 (jnp.asarray(regions), jax.tree.map(lambda *leaves: jnp.stack(leaves), *widths)),
             )
             layers.update((region, jax.tree.map(itemgetter(k), together)) for k, region in enumerate(regions))
@@ -213,10 +220,10 @@ def _interface(
     enters: bool,
     next_event: NextEvent,
     region: int | Array,
-    numbers: tuple[Scalars, OneWidth],
+    numbers: tuple[Scalars, OneWidth, fresnel.Film | None],
     requested: Array | None,
 ) -> Layer:
-    indices, width = numbers
+    indices, width, film = numbers
     dtype = indices[0].dtype
     grid = _grid(plan, indices, dtype)
     above, below = (_region(grid, place) for place in (region, region + 1))
@@ -232,24 +239,31 @@ def _interface(
         enters=enters,
         requested=outside,
         next_event=next_event,
+        film=film,
     )
 
 
 def _anisotropic_interface(
-    plan: Plan, distribution: Distribution, enters: bool, region: int, numbers: tuple[Scalars, Widths], _: None
+    plan: Plan,
+    distribution: Distribution,
+    enters: bool,
+    region: int,
+    numbers: tuple[Scalars, Widths, fresnel.Film | None],
+    _: None,
 ) -> Layer:
-    indices, widths = numbers
+    indices, widths, film = numbers
     grid = _grid(plan, indices, indices[0].dtype)
     normals = Normals(cast_arrays(widths, indices[0].dtype), distribution)
     assert plan.azimuths is not None
     return anisotropic_interface(
-        grid, grid.regions[region], grid.regions[region + 1], normals, plan.azimuths, enters=enters
+        grid, grid.regions[region], grid.regions[region + 1], normals, plan.azimuths, enters=enters, film=film
     )
 
 
-def _smooth_interface(plan: Plan, region: int, indices: Scalars, _: None) -> Layer:
+def _smooth_interface(plan: Plan, region: int, numbers: tuple[Scalars, fresnel.Film | None], _: None) -> Layer:
+    indices, film = numbers
     grid = _grid(plan, indices, indices[0].dtype)
-    return smooth_layer(grid.regions[region], grid.regions[region + 1])
+    return smooth_layer(grid.regions[region], grid.regions[region + 1], film)
 
 
 def _numbered_interface(
@@ -257,14 +271,14 @@ def _numbered_interface(
     distribution: Distribution,
     enters: bool,
     next_event: NextEvent,
-    numbers: tuple[Scalars, OneWidth],
+    numbers: tuple[Scalars, OneWidth, None],
     region: Array,
 ) -> Layer:
     """An interface under a region whose number is traced."""
     return _interface(plan, distribution, enters, next_event, region, numbers, None)
 
 
-def _interface_step(numbers: tuple[Scalars, OneWidth]) -> float | None:
+def _interface_step(numbers: tuple[Scalars, OneWidth, fresnel.Film | None]) -> float | None:
     """See `linearize_element`: an interface varies with alpha and the indices like a lobe does, over its width.
 
     None where indices meet or the width ends: there its derivatives are one-sided.

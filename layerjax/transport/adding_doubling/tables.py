@@ -21,7 +21,7 @@ import numpy as np
 from jax import Array
 
 from layerjax._numerics import allow_broadcasting, horizon, safe_div, scale_tangent
-from layerjax.channels import Channels
+from layerjax.channels import Channels, map_channels, multiply
 from layerjax.directions import Vector, select
 from layerjax.quadrature import gauss_legendre
 from layerjax.transport.adding_doubling.energies import OuterFace, node_shares
@@ -128,8 +128,8 @@ def make_tables(
 
 
 def _passed(window: Window, region: Region) -> Array:
-    """What a smooth interface passes of light along the nodes."""
-    return window.cross((region.sine, jnp.zeros_like(region.sine), region.cosine))[1][0]
+    """What a smooth interface passes of light along the nodes, (channels or 1, nodes)."""
+    return jnp.stack(window.cross((region.sine, jnp.zeros_like(region.sine), region.cosine))[1])
 
 
 def _values(
@@ -175,8 +175,9 @@ def _quadrant(
     if out.passed is None and into.passed is None:
         values = mean * (jnp.repeat(out.region.cosine, count)[:, None] + jnp.repeat(into.region.cosine, count))
     else:
-        leaving, entering = (jnp.repeat(_share_passed(end), count) for end in (out, into))
-        values = safe_div(mean, jnp.broadcast_to(jnp.outer(leaving, entering), mean.shape))
+        leaving, entering = (jnp.repeat(_share_passed(end), count, axis=-1) for end in (out, into))
+        shares = leaving[:, None, :, None] * entering[:, None, None, :]
+        values = safe_div(mean, jnp.broadcast_to(shares, mean.shape))
     fine = _lift_values(values, out, into)
     if steps is None:
         return fine[:, 0]
@@ -184,8 +185,10 @@ def _quadrant(
 
 
 def _share_passed(end: _End) -> Array:
-    """What a smooth interface passes along every node, 1 where there is none."""
-    return jnp.ones_like(end.region.cosine) if end.passed is None else jnp.where(end.region.exists, end.passed, 0.0)
+    """What a smooth interface passes along every node, (channels or 1, nodes), 1 where there is none."""
+    if end.passed is None:
+        return jnp.ones_like(end.region.cosine)[None]
+    return jnp.where(end.region.exists, end.passed, 0.0)
 
 
 def _energy(flux: Operator, onward: Channels | None, share: Channels | None, end: _End) -> Array:
@@ -292,25 +295,28 @@ def read_rest(tables: Tables, wi: Vector, wo: Vector, side: Side) -> Channels:
     ]
     if tables.steps is not None:
         axes.append(_azimuth_points(into, out, tables.steps))
-    factor = jnp.where(valid, scale * _weight(tables, out, into, quadrant), 0.0)
-    found = _read(tables, tables.values, start, axes, [(out, ior_out), (into, ior_into)])
-    return tuple(factor * value for value in found)
+    factors = tuple(jnp.where(valid, scale * weight, 0.0) for weight in _weight(tables, out, into, quadrant))
+    return multiply(factors, _read(tables, tables.values, start, axes, [(out, ior_out), (into, ior_into)]))
 
 
-def _weight(tables: Tables, out: Vector, into: Vector, quadrant: Array) -> Array:
+def _weight(tables: Tables, out: Vector, into: Vector, quadrant: Array) -> Channels:
     """What values are in proportion to, of directions both turned to above; quadrants: see `Tables`."""
     sum_of_cosines = 1.0 / (out[2] + into[2])
     if all(window is None for window in tables.windows):
-        return sum_of_cosines
-    top, bottom = (
-        None if window is None else [window.cross(w)[1][0] for w in (out, into)] for window in tables.windows
-    )
-    above = sum_of_cosines if top is None else top[0] * top[1]
+        return (sum_of_cosines,)
+    top, bottom = (None if window is None else [window.cross(w)[1] for w in (out, into)] for window in tables.windows)
+    above = (sum_of_cosines,) if top is None else multiply(*top)
     if tables.opaque:
         return above
-    below = sum_of_cosines if bottom is None else bottom[0] * bottom[1]
-    across = (1.0 if bottom is None else bottom[0]) * (1.0 if top is None else top[1])
-    return jnp.where(quadrant == 0, above, jnp.where(quadrant == 1, below, across))
+    below = (sum_of_cosines,) if bottom is None else multiply(*bottom)
+    one: Channels = (jnp.ones_like(sum_of_cosines),)
+    across = multiply(one if bottom is None else bottom[0], one if top is None else top[1])
+    return map_channels(
+        lambda *kinds: jnp.where(quadrant == 0, kinds[0], jnp.where(quadrant == 1, kinds[1], kinds[2])),
+        above,
+        below,
+        across,
+    )
 
 
 def read_energies(tables: Tables, wi: Vector) -> list[Channels]:

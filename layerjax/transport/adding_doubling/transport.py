@@ -74,7 +74,7 @@ from layerjax.transport.adding_doubling.solve import (
     without_base,
 )
 from layerjax.transport.adding_doubling.tables import Tables, make_tables, read_energies, read_rest
-from layerjax.transport.contract import DeterministicTransport, Side, require_ggx
+from layerjax.transport.contract import DeterministicTransport, Side, refuse_interface_film, require_ggx
 from layerjax.transport.first_order import (
     FirstOrder,
     SmoothOrder,
@@ -204,6 +204,8 @@ class AddingDoubling(DeterministicTransport):
     def check(self, stack: Stack, names: Sequence[str]) -> None:
         if self.facet_multiple_scattering:
             require_ggx(stack, names, "AddingDoubling(facet_multiple_scattering=True)")
+            name = "AddingDoubling(facet_multiple_scattering=True)"
+            refuse_interface_film(stack, names, name, rough_only=True)
 
     def resolve_options(self, stack: Stack, known: DirectionLookup) -> "AddingDoubling":
         found = requested_stack(stack, known) if self.orders != "first" else None

@@ -115,7 +115,7 @@ def inner_slab_concentration(j: int, cosine: Array, top: UpperSide, base: LowerS
 
 def _refraction(top: UpperSide, masking: vmf.Masking | None, wi: Vector, under: Vector) -> Array:
     """BTDF of one rough interface (Walter et al. 2007, Eq. 21, with its eta_o^2); a delta, given as 0, at eta = 1."""
-    lobe, transmitted = refraction_lobe(wi, flip(under), top.ior, width(top.kappa), "vmf")
+    lobe, (transmitted,) = refraction_lobe(wi, flip(under), top.ior, width(top.kappa), "vmf")
     return (
         lobe
         * transmitted

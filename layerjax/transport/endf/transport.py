@@ -126,7 +126,7 @@ class ENDF(DeterministicTransport):
                 f"base: ENDF carries no {type(stack.base).__name__} (a Conductor, or no base); Statistical, "
                 "AddingDoubling and RandomWalk do"
             )
-        refuse_film(stack.base, "ENDF")
+        refuse_film(stack, names, "ENDF")
 
     def prepare(self, stack: Stack) -> Sides:
         faces = [layer for layer in stack.layers if isinstance(layer, Interface)]

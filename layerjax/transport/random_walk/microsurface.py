@@ -139,7 +139,7 @@ def _interface_contribution(wi: Vector, wo: Vector, height: Array, ior: Array, a
     """Light that a dielectric facet at this height, met along wi, sends to wo and out of the surface, 1/sr."""
     lobe, cosine = _mirror_contribution(wi, wo, height, alpha)
     reflected = lobe * fresnel.dielectric(jnp.minimum(cosine, 1.0), ior)
-    facets, transmittance = refraction_lobe(wi, wo, ior, alpha)
+    facets, (transmittance,) = refraction_lobe(wi, wo, ior, alpha)
     escape = escape_probability(flip(wo), opposite_height(height), alpha)
     refracted = facets * transmittance / facing_area(scale(-1.0, wi), alpha) * escape
     return jnp.where(wo[2] > 0, reflected, jnp.where(facets > 0, refracted, 0.0))

@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from layerjax.channels import Channels, pick
+from layerjax.channels import Channels, map_channels, pick
 from layerjax.directions import Vector, scale, select
 from layerjax.transport.random_walk import surfaces
 from layerjax.transport.random_walk.scene import Scene, choose
@@ -62,7 +62,7 @@ def make_goal(scene: Scene, wo: Vector) -> Goal:
 def no_aim(scene: Scene, direction: Vector) -> Aim:
     """Stands in until an aim is drawn."""
     zero = jnp.zeros_like(direction[2])
-    return Aim(direction, [zero] * len(scene.media), zero, zero)
+    return Aim(direction, [zero] * len(scene.media), (zero,) * scene.film_channels, zero)
 
 
 def no_relay(scene: Scene, direction: Vector) -> Relay:
@@ -122,9 +122,10 @@ def meet_exit(
     found = (path.region == goal.inner) & hit.survives
     ior = scene.surface_ior(goal.exit, goal.above)
     if multiple:  # drawn by the walk itself
-        passed = 1.0 / jnp.maximum(jnp.abs(inside[2]), jnp.finfo(scene.dtype).tiny * 1e4)
+        passed = (1.0 / jnp.maximum(jnp.abs(inside[2]), jnp.finfo(scene.dtype).tiny * 1e4),) * scene.film_channels
     travel = scale(-1.0, hit.direction)
-    drawn = Aim(travel, scene.rates(travel), jnp.where(found, passed / (ior * ior), 0.0), density)
+    weights = tuple(jnp.where(found, share / (ior * ior), 0.0) for share in passed)
+    drawn = Aim(travel, scene.rates(travel), weights, density)
     ready = path.aiming & leaves & at_exit
     aim = jax.tree.map(lambda new, old: jnp.where(ready, new, old), drawn, path.aim)
     weight = jnp.ones_like(density)
@@ -166,16 +167,16 @@ def meet_opposite(
     travel, onward = scale(-1.0, hit.direction), scale(-1.0, path.direction)
     drawn = jnp.maximum(turns(path.direction, hit.direction), tiny)
     walked = jnp.ones_like(drawn)
-    share: Array | float = 1.0
+    shares: tuple[Any, ...] = (1.0,)
     if path.aim is not None:
         walked = jnp.minimum(1.0 + turns(travel, onward) / jnp.maximum(path.aim.density, tiny), most)
-        share = path.aim.weight
+        shares = path.aim.weight
     turned = jnp.abs(path.direction[2]) / jnp.maximum(jnp.abs(hit.direction[2]), tiny)
     found = hit.survives & ~hit.crosses & at_opposite  # a ray still at the exit has none yet
     rates = goal.rates if path.aim is None else path.aim.rates
     crossed = [jnp.where(goal.inner == region, 1.0, 0.0) for region in scene.region_of]
     passed = scene.transmittance(crossed, rates) if scene.media else (jnp.ones_like(drawn),)
-    weight = tuple(pick(hit.weight, c) * pick(passed, c) * turned * share for c in range(scene.channels))
+    weight = tuple(pick(hit.weight, c) * pick(passed, c) * turned * pick(shares, c) for c in range(scene.channels))
     weight = tuple(jnp.where(found, w, 0.0) for w in weight)
     of_relay = jnp.minimum(walked / drawn, most)
     aiming, relay = path.aiming, Relay(travel, scene.rates(travel), weight, jnp.where(found, of_relay, 0.0))
@@ -204,8 +205,11 @@ def contribution(
         if event.density is not None:
             rivals = path.aim.density if event.rivals is None else path.aim.density * event.rivals
             total = event.density + rivals
-            aimed = aimed * path.aim.density / jnp.where(total > 0, total, 1.0)  # balance heuristic
-        factors = tuple(jnp.where(direct, unaimed, aimed * outer) for outer in goal.outer_transmittance)
+            share = jnp.where(total > 0, total, 1.0)
+            aimed = tuple(one * path.aim.density / share for one in aimed)  # balance heuristic
+        factors = map_channels(
+            lambda aimed, outer: jnp.where(direct, unaimed, aimed * outer), aimed, goal.outer_transmittance
+        )
         exit_level = choose(goal.exit, [jnp.int32(level) for level in scene.levels[: len(scene.interfaces)]])
         ends = [jnp.where(direct, end, jnp.where(exit_level > j, 1.0, 0.0)) for j, end in enumerate(ends)]
         rates = [jnp.where(direct, a, b) for a, b in zip(rates, path.aim.rates, strict=True)]

@@ -20,6 +20,7 @@ from layerjax.directions import Vector, add, combine, dot, frame, half_vector, s
 from layerjax.phase import PhaseFunction
 from layerjax.stack import Interface, Stack, is_known, media_of
 from layerjax.surfaces import Conductor
+from layerjax.surfaces.thin_film import BARE, Films, films_of
 from layerjax.transport.random_walk.random_numbers import circle
 
 
@@ -155,6 +156,30 @@ class Scene:
         below = choose(surface, [b for _, b in pairwise(self.indices)])
         above = choose(surface, [a for a, _ in pairwise(self.indices)])
         return jnp.where(from_above, below, above) / jnp.where(from_above, above, below)
+
+    @property
+    def film_channels(self) -> int:
+        """Number of channels of what films reflect, 1 if there are none."""
+        return self.channels if any(interface.film is not None for interface in self.interfaces) else 1
+
+    def films(self, surface: Array | None, from_above: Array) -> Films:
+        """Films of an interface, one a channel, as seen from the side that light arrives from; where only others have
+        one, films without thickness."""
+        if all(interface.film is None for interface in self.interfaces):
+            return BARE
+        here = jnp.where(
+            from_above,
+            choose(surface, [above for above, _ in pairwise(self.indices)]),
+            choose(surface, [below for _, below in pairwise(self.indices)]),
+        )
+        one, zero = jnp.ones((), self.dtype), jnp.zeros((), self.dtype)
+
+        def film(c: int) -> fresnel.Film:
+            found = [pick(films_of(interface.film), c) or fresnel.Film(one, zero) for interface in self.interfaces]
+            iors, phases = zip(*found, strict=True)
+            return fresnel.Film(choose(surface, iors), choose(surface, phases)).seen_from(here)
+
+        return tuple(map(film, range(self.channels)))
 
 
 def _deflect(wi: Vector, cosine: Array, sine: Array, u2: Array) -> Vector:

@@ -16,7 +16,7 @@ class Aim(NamedTuple):
 
     travel: Vector
     rates: list[Array]
-    weight: Array
+    weight: Channels
     """What the interface passes from it to wo, over the density of the draw."""
     density: Array
 

@@ -14,20 +14,22 @@ from jax import Array
 
 from layerjax import fresnel
 from layerjax._numerics import safe_div
-from layerjax.channels import Channels, pick
+from layerjax.channels import Channels, mean, pick
 from layerjax.directions import Vector, bend, mirror, sanitise, scale, select
 from layerjax.normals.facets import Distribution, draw_weight, masking, twice_projected_area
 from layerjax.normals.widths import Tailed, Width, Widths
 from layerjax.stack import Interface
 from layerjax.surfaces import Conductor, Surface
 from layerjax.surfaces.interface import (
+    event_weights,
     facet_normal,
     interface_event,
     interface_pdf,
-    interface_reflection,
-    interface_transmission,
+    reflected_channels,
     refraction_lobe,
+    transmitted_channels,
 )
+from layerjax.surfaces.thin_film import Films
 from layerjax.transport.random_walk.scene import Scene, choose
 
 DIFFUSE_SHARE = 0.1
@@ -120,22 +122,26 @@ def bounce(
     results = []
     if at_base is not True:
         ior = scene.surface_ior(surface, from_above)
+        films = scene.films(surface, from_above)
         u3 = u3 if refracts is None else jnp.where(refracts, 2.0, u3)
 
         def event(alpha: Width, distribution: Distribution) -> Bounce:
-            wo, leaves, m = interface_event(wi, ior, alpha, u1, u2, u3, distribution)
+            wo, leaves, m, shares = interface_event(wi, ior, alpha, u1, u2, u3, distribution, films)
+            if refracts is not None:
+                shares = tuple(jnp.where(refracts, 1.0, share) for share in shares)
             weight = masking((wo[0], wo[1], jnp.abs(wo[2])), alpha, distribution)
             if distribution == "vmf" and not isinstance(alpha, Widths | Tailed):
                 weight = weight * draw_weight(wi, m, alpha)
             sent: Channels = ()
             if towards is not None:
-                sent = (_interface(wi, towards, ior, alpha, distribution) * jnp.abs(towards[2]),)
-            return Bounce(sent, wo, wo[2] < 0, (weight,), leaves)
+                values = _interface(wi, towards, ior, alpha, distribution, films)
+                sent = tuple(value * jnp.abs(towards[2]) for value in values)
+            return Bounce(sent, wo, wo[2] < 0, tuple(weight * share for share in shares) or (weight,), leaves)
 
         smooth = any(scene.is_smooth)
         met = None if all(scene.is_smooth) else _by_normals(scene, surface, event)
         if smooth:
-            ray = _meet_smooth(wi, ior, u3, towards)
+            ray = _meet_smooth(wi, ior, films, u3, towards)
             mask = choose(surface, [jnp.asarray(kind) for kind in (*scene.is_smooth, False)])
             met = ray if met is None else merge(mask, ray, met)
         assert met is not None
@@ -156,14 +162,16 @@ def bounce(
     return result._replace(direction=orient(result.direction, from_above))
 
 
-def _meet_smooth(wi: Vector, ior: Array, u: Array, target: Vector | None) -> Bounce:
-    """Reflection or refraction at a smooth interface, chosen by Fresnel's shares."""
+def _meet_smooth(wi: Vector, ior: Array, films: Films, u: Array, target: Vector | None) -> Bounce:
+    """Reflection or refraction at a smooth interface, chosen by Fresnel's shares, the mean of the channels."""
     behind, exists = bend(wi, ior)
-    level = fresnel.dielectric_towards(wi[2], ior, behind[2], exists)
+    levels = tuple(fresnel.dielectric_towards(wi[2], ior, behind[2], exists, film) for film in films)
+    level = mean(levels)
     reflects = (u < level) | ~exists
     wo = select(reflects, mirror(wi), scale(-1.0, behind))
     zero, yes = jnp.zeros_like(level), jnp.ones(level.shape, bool)
-    return Bounce(() if target is None else (zero,), wo, ~reflects, (zero + 1.0,), yes)
+    weight = event_weights(levels, reflects) or (zero + 1.0,)
+    return Bounce(() if target is None else (zero,), wo, ~reflects, weight, yes)
 
 
 def base_towards(base: Surface, wi: Vector, towards: Vector) -> Channels:
@@ -196,10 +204,11 @@ def density(
     at_base = is_base(scene, surface)
     value: Array | None = None
     if at_base is not True:
-        ior = scene.surface_ior(surface, from_above)
+        ior, films = scene.surface_ior(surface, from_above), scene.films(surface, from_above)
 
         def drawn(alpha: Width, distribution: Distribution) -> Array:
-            return interface_pdf(_interface(wi, wo, ior, alpha, distribution), wi, wo, ior, alpha, distribution)
+            value = mean(_interface(wi, wo, ior, alpha, distribution, films))
+            return interface_pdf(value, wi, wo, ior, alpha, distribution)
 
         value = _by_normals(scene, surface, drawn)
     if at_base is not False:
@@ -213,37 +222,39 @@ def density(
 
 def interface_towards(
     scene: Scene, surface: Array | None, from_above: Array, travel: Vector, target: Vector
-) -> tuple[Array, Array]:
+) -> tuple[Channels, Array]:
     """What an interface sends to a direction of travel, per solid angle, and the density with which it is drawn."""
     wi, towards = _clamp_to_upper(orient(travel, from_above, -1.0)), orient(target, from_above)
-    ior = scene.surface_ior(surface, from_above)
+    ior, films = scene.surface_ior(surface, from_above), scene.films(surface, from_above)
 
-    def sent(alpha: Width, distribution: Distribution) -> tuple[Array, Array]:
-        value = _interface(wi, towards, ior, alpha, distribution)
-        return value * jnp.abs(towards[2]), interface_pdf(value, wi, towards, ior, alpha, distribution)
+    def sent(alpha: Width, distribution: Distribution) -> tuple[Channels, Array]:
+        values = _interface(wi, towards, ior, alpha, distribution, films)
+        density = interface_pdf(mean(values), wi, towards, ior, alpha, distribution)
+        return tuple(value * jnp.abs(towards[2]) for value in values), density
 
     return _by_normals(scene, surface, sent)
 
 
 def exit_density(
     scene: Scene, surface: Array, above: Array, leaving: Vector, inside: Vector, *, diffuse: bool
-) -> tuple[Array, Array]:
+) -> tuple[Array, Channels]:
     """Density with which an interface, seen from outside along `leaving`, refracts to the direction `inside`.
 
     Both directions point away from the interface; `above` says on which side `leaving` lies. Also the transmittance of
     the facet, G1 / cos of `inside` and what the draw weighs, multiplied.
     """
     wi, wo = orient(leaving, above), orient(inside, above)
-    ior = scene.surface_ior(surface, above)
+    ior, films = scene.surface_ior(surface, above), scene.films(surface, above)
 
-    def drawn(alpha: Width, distribution: Distribution) -> tuple[Array, Array]:
-        lobe, transmittance = refraction_lobe(wi, wo, ior, alpha, distribution)
+    def drawn(alpha: Width, distribution: Distribution) -> tuple[Array, Channels]:
+        lobe, transmittances = refraction_lobe(wi, wo, ior, alpha, distribution, films)
         value = jnp.where(wo[2] < 0, 2.0 * lobe / twice_projected_area(wi[2], wi, alpha, distribution), 0.0)
-        passed = transmittance * 2.0 / twice_projected_area(jnp.abs(wo[2]), wo, alpha, distribution)
+        area = twice_projected_area(jnp.abs(wo[2]), wo, alpha, distribution)
+        passed = tuple(transmittance * 2.0 / area for transmittance in transmittances)
         if distribution != "vmf" or isinstance(alpha, Widths | Tailed):
             return value, passed
         weight = draw_weight(wi, facet_normal(wi, wo, ior), alpha)
-        return value / weight, passed * weight
+        return value / weight, tuple(share * weight for share in passed)
 
     value, passed = _by_normals(scene, surface, drawn)
     if diffuse:
@@ -277,12 +288,13 @@ def _weight(value: Array, density: Array, base: Surface) -> Array:
     return safe_div(value, density) if vanishes else value / density
 
 
-def _interface(wi: Vector, wo: Vector, ior: Array, alpha: Width, distribution: Distribution) -> Array:
+def _interface(wi: Vector, wo: Vector, ior: Array, alpha: Width, distribution: Distribution, films: Films) -> Channels:
     """BSDF of an interface, of whichever kind the side of wo asks for."""
     above = wo[2] > 0
-    reflected = interface_reflection(wi, sanitise(wo, above), ior, alpha, distribution)
-    refracted = interface_transmission(wi, (wo[0], wo[1], jnp.where(above, -0.5, wo[2])), ior, alpha, distribution)
-    return jnp.where(above, reflected, refracted)
+    under: Vector = (wo[0], wo[1], jnp.where(above, -0.5, wo[2]))
+    reflected = reflected_channels(wi, sanitise(wo, above), ior, alpha, distribution, films)
+    refracted = transmitted_channels(wi, under, ior, alpha, distribution, films)
+    return tuple(jnp.where(above, one, other) for one, other in zip(reflected, refracted, strict=True))
 
 
 def _clamp_to_upper(w: Vector) -> Vector:

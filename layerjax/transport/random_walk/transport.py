@@ -19,7 +19,7 @@ from layerjax.directions import Vector, flip, half_vector, reflect, sanitise, se
 from layerjax.normals.facets import reflection_pdf, sample
 from layerjax.stack import Interface, Stack
 from layerjax.surfaces.lambertian import sample_cosine
-from layerjax.transport.contract import RandomTransport, Side, refuse_smooth, require_ggx
+from layerjax.transport.contract import RandomTransport, Side, refuse_interface_film, refuse_smooth, require_ggx
 from layerjax.transport.random_walk.batches import average, replace_invalid
 from layerjax.transport.random_walk.scene import Scene
 from layerjax.transport.random_walk.state import Step
@@ -59,6 +59,7 @@ class RandomWalk(RandomTransport):
             refuse_smooth(stack, names, f'RandomWalk(orders="{self.orders}")')
         if self.facet_multiple_scattering:
             require_ggx(stack, names, "RandomWalk(facet_multiple_scattering=True)")
+            refuse_interface_film(stack, names, "RandomWalk(facet_multiple_scattering=True)", rough_only=True)
 
     def prepare(self, stack: Stack) -> Stack:
         return stack

@@ -248,7 +248,7 @@ class Walk:
             opposite = opposite & (surface == self.goal.opposite)
         if scene.interfaces:
             sent, density = surfaces.interface_towards(scene, surface, from_above, path.direction, path.relay.travel)
-            event = event._replace(relayed=(sent,), relayed_density=density)
+            event = event._replace(relayed=sent, relayed_density=density)
         relay, to_target, onward = meet_opposite(scene, self.goal, path, surface, from_above, hit, towards, opposite)
         next_density = None if event.next_density is None else event.next_density / onward
         return path._replace(relay=relay), event._replace(rivals=to_target, next_density=next_density)

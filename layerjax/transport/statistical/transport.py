@@ -131,7 +131,7 @@ class Statistical(DeterministicTransport):
 
     def check(self, stack: Stack, names: Sequence[str]) -> None:
         require_ggx(stack, names, "Statistical")
-        refuse_film(stack.base, "Statistical")
+        refuse_film(stack, names, "Statistical")
         _check_indices(stack, names)
         for name, layer in zip(names, stack.layers, strict=True):
             if isinstance(layer, Medium) and layer.phase.forward_lobe is None:

@@ -121,6 +121,7 @@ def test_dictionary_round_trip():
         lj.Stack([lj.Medium(thickness=1 / 3, phase=lj.HenyeyGreenstein(g=Free(0.1, -0.9, 0.9)), f0=0.04)]),
         lj.Stack([lj.Medium(Free(1.0, 0.1, 10.0, LogUniform()), phase=lj.Rayleigh())], lj.OrenNayar(0.5, 0.3)),
         lj.Stack([lj.Interface(Free(1.5, 1.3, 1.7))], lj.Conductor(0.2, 3.9)),
+        lj.Stack([lj.Interface(1.5, film=lj.ThinFilm(1.38, Free(99.0, 0.0, 200.0), [610.0, 550.0]))]),
         lj.Stack([lj.TurbidMedium(0.2, LAW, 0.5, lj.HenyeyGreenstein(0.3))]),
     ):
         assert_same(stack_from_dict(material_to_dict(stack)), stack)
@@ -155,6 +156,7 @@ WRONG = {
     FACE + "smooth = 1\n": r"layers\[0\].smooth: 1 is neither true nor false",
     FACE + "smooth = true\nalpha = 0.1\n": r"layers\[0\].smooth: true, and alpha given as well",
     TINTED.format("{ ior = 1 }"): "base.film has no thickness_nm, which ThinFilm needs",
+    FACE + "smooth = true\nfilm = { ior = 1.4 }\n": r"layers\[0\]\.film has no thickness_nm, which ThinFilm needs",
     TINTED.format("3"): r"base: Conductor\.film: 3 is not a ThinFilm or None",
     BASE + "scale = { start = [1, 1], low = 0.5, high = 2 }\n": "scale has 2 channels, must be one number for all",
     BASE + "instrument = { detector_aperture = 31 }\n": r"instrument.detector_aperture is 31; .* in \[0, 30\]",
