@@ -32,6 +32,7 @@ STACKS = {
     "rough paint": Stack([], OrenNayar(0.5, 0.4)),
     "metal": Stack([], METAL),
     "metal, beckmann": Stack([], Conductor(0.4, 2.0, 0.3, "beckmann")),
+    "metal, gtr": Stack([], Conductor(0.4, 2.0, 0.3, "gtr", gamma=3.0)),
     "metal, vmf": Stack([], Conductor(0.4, 2.0, 0.3, "vmf")),
     "tinted metal": Stack([], TINTED),
     "face": Stack([FACE]),

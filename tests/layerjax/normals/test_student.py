@@ -167,7 +167,7 @@ def test_energies_of_a_conductor_are_those_of_draws():
         assert found[0] < 1.0
 
 
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("dtype", [np.float32, pytest.param(np.float64, marks=pytest.mark.slow)])
 def test_values_draws_and_slopes_are_finite(dtype):
     random = np.random.default_rng(8)
     wi, wo, ior, alpha = pairs(random, 2000, [1e-4, 0.01, 0.3, 1.0], dtype)
