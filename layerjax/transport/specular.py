@@ -199,6 +199,35 @@ def _behind_face(level: Array, reflected: Channels, passed: Channels) -> tuple[C
     return whole, multiply(turns, passed)
 
 
+class Turns(eqx.Module):
+    """All the times that light which entered through a smooth interface is mirrored between that and what lies behind.
+
+    face: indices before and behind; behind: what mirrors light back, without a base; turned: see `ray_shares`.
+    """
+
+    face: tuple[Array, Array]
+    behind: tuple[Crossed, ...]
+    turned: bool = eqx.field(static=True)
+
+    def count(self, w: Vector) -> Channels:
+        """How often on average light along w, outside, sets off from the interface; 1 where there is no such light."""
+        w = sanitise(w, jnp.abs(w[2]) > horizon(w[2].dtype))
+        ratio = self.face[1] / self.face[0]
+        there, exists = bend(w, ratio)
+        level = fresnel.dielectric_towards(jnp.abs(w[2]), ratio, jnp.abs(there[2]), exists)
+        level = jnp.where(exists, level, 0.0)
+        reflected, _ = ray_shares(self.behind, self.face[0], None, w, turned=self.turned)
+        return tuple(1.0 / clamp_min(1.0 - level * part, LEAST_LOSS) for part in reflected)
+
+
+def smooth_turns(stack: Stack, *, upward: bool) -> Turns | None:
+    """The turns behind the `smooth_window`."""
+    if smooth_window(stack, upward=upward) is None:
+        return None
+    first, *behind = crossed_layers(stack, region_indices(stack))[:: -1 if upward else 1]
+    return Turns((first[2], first[1]) if upward else (first[1], first[2]), tuple(behind), upward)
+
+
 def windows(stack: Stack) -> list[tuple[int, int, Window | None, Window | None]]:
     """The runs of layers between smooth interfaces, as (first layer, one past the last), and through what each is seen
     from above and from below; None: it is not, because a rough surface lies between."""
