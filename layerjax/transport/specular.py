@@ -219,6 +219,38 @@ def _behind_face(levels: Channels, reflected: Channels, passed: Channels) -> tup
     return whole, multiply(turns, passed)
 
 
+class Turns(eqx.Module):
+    """All the times that light which entered through a smooth interface is mirrored between that and what lies behind.
+
+    behind: what mirrors light back, without a base; turned: see `ray_shares`.
+    """
+
+    face: Face
+    behind: tuple[Crossed, ...]
+    turned: bool = eqx.field(static=True)
+
+    def count(self, w: Vector) -> Channels:
+        """How often on average light along w, outside, sets off from the interface; 1 where there is no such light."""
+        w = sanitise(w, jnp.abs(w[2]) > horizon(w[2].dtype))
+        there, exists = bend(w, self.face.ratio)
+        levels = self.face.reflectance(jnp.abs(w[2]), jnp.abs(there[2]), exists)
+        reflected, _ = ray_shares(self.behind, self.face.before, None, w, turned=self.turned)
+        return map_channels(
+            lambda level, part: 1.0 / clamp_min(1.0 - jnp.where(exists, level, 0.0) * part, LEAST_LOSS),
+            levels,
+            reflected,
+        )
+
+
+def smooth_turns(stack: Stack, *, upward: bool) -> Turns | None:
+    """The turns behind the `smooth_window`."""
+    if smooth_window(stack, upward=upward) is None:
+        return None
+    (layer, *indices), *behind = crossed_layers(stack, region_indices(stack))[:: -1 if upward else 1]
+    before, after = indices[::-1] if upward else indices
+    return Turns(Face(before, after, layer.film), tuple(behind), upward)
+
+
 def windows(stack: Stack) -> list[tuple[int, int, Window | None, Window | None]]:
     """The runs of layers between smooth interfaces, as (first layer, one past the last), and through what each is seen
     from above and from below; None: it is not, because a rough surface lies between."""

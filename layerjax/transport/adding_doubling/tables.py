@@ -1,7 +1,8 @@
 """Where the several-event part of a solved stack is read off: tables over directions, cubic between their points.
 
 What is tabulated is f / ior_o^2 (mu_i + mu_o), a smooth function down to grazing light on both sides, made reciprocal.
-Where the outermost layer is a smooth interface it is f / ior_o^2 over what that passes either way.
+Where the outermost layer is a smooth interface it is f / ior_o^2 over what that passes either way, all turns between it
+and the smooth interfaces behind counted.
 A table is finer than the grid: polynomials in the cosine and Fourier series in azimuth carry the values over. Modes are
 summed at its azimuths, 0 to pi, so that a pair reads 64 numbers however many modes there are.
 
@@ -21,7 +22,8 @@ import numpy as np
 from jax import Array
 
 from layerjax._numerics import allow_broadcasting, horizon, safe_div, scale_tangent
-from layerjax.channels import Channels, map_channels, multiply
+from layerjax.channels import Channels, multiply
+from layerjax.channels import select as select_channels
 from layerjax.directions import Vector, select
 from layerjax.quadrature import gauss_legendre
 from layerjax.transport.adding_doubling.energies import OuterFace, node_shares
@@ -29,7 +31,7 @@ from layerjax.transport.adding_doubling.grid import Grid, Region, root_along, ro
 from layerjax.transport.adding_doubling.interpolate import Axis, look_up
 from layerjax.transport.adding_doubling.operators import Layer, Operator, rotate
 from layerjax.transport.contract import Side
-from layerjax.transport.specular import Window
+from layerjax.transport.specular import Turns, Window
 
 AZIMUTH_DENSITY = 2
 """Azimuths of a table for each ordinate of the grid."""
@@ -55,6 +57,8 @@ class Tables(eqx.Module):
     energies: tuple[Array, ...]
     windows: tuple[Window | None, Window | None]
     """Smooth interfaces that light from above meets first, and from below."""
+    turns: tuple[Turns | None, Turns | None]
+    """Between these and what lies behind them; None: in the values."""
     opaque: bool = eqx.field(static=True)
     azimuths: int | None = eqx.field(static=True)
     steps: int | None = eqx.field(static=True)
@@ -62,11 +66,13 @@ class Tables(eqx.Module):
 
 class _End(NamedTuple):
     """The medium above or below the stack: its nodes, matrices from values there to the points of a table, what a
-    smooth interface passes of light along the nodes (None: there is none), and `_roots`."""
+    smooth interface passes of light along the nodes (None: there is none), the turns behind it, (channels, nodes), and
+    `_roots`."""
 
     region: Region
     lift: Array
     passed: Array | None
+    turns: Array | None
     roots: tuple[Array, Array] | None
 
 
@@ -80,6 +86,7 @@ def make_tables(
     faces: tuple[OuterFace | None, OuterFace | None] | None,
     peak_probability: Callable[[Vector], Channels | None] | None,
     windows: tuple[Window | None, Window | None],
+    turns: tuple[Turns | None, Turns | None],
 ) -> Tables:
     """Tables of a solved stack.
 
@@ -92,7 +99,7 @@ def make_tables(
         interaction_probability: that light along a direction meets an event at all, per channel (None: 1).
         faces: see `outer_faces`; None, if there are no interfaces.
         onward_probability: of what does, that the layers have it as passing untouched (None: 0).
-        windows: see `Tables`.
+        windows, turns: see `Tables`.
     """
     modes = max(flux.shape[1] for flux in jax.tree.leaves(whole))
     steps = None if azimuths is not None or modes == 1 else MODE_DENSITY * modes
@@ -101,9 +108,10 @@ def make_tables(
             region,
             _lift(grid, region, modes, azimuths),
             None if window is None else _passed(window, region),
+            None if counted is None else _turns_along(counted, region),
             _roots(grid, azimuths),
         )
-        for region, window in zip((grid.regions[0], grid.regions[-1]), windows, strict=True)
+        for region, window, counted in zip((grid.regions[0], grid.regions[-1]), windows, turns, strict=True)
     )
     values = _values(rest, top, bottom, azimuths, steps, opaque)
 
@@ -114,7 +122,8 @@ def make_tables(
     for (end, found, side), face in zip(lit, faces or (None, None), strict=False):
         if faces is not None:
             weight = jnp.repeat(end.region.weight, azimuths or 1)
-            rows.append(list(_lift_energies(node_shares(found, face, weight), end)))
+            shares = node_shares(found, face, weight)
+            rows.append(list(_lift_energies(shares if end.turns is None else shares / end.turns, end)))
         else:
             directions = _node_directions(end.region, azimuths, side)
             share = interaction_probability(directions)
@@ -124,12 +133,18 @@ def make_tables(
             )
     shape = (max(energy.shape[0] for row in rows for energy in row), rows[0][0].shape[-1])
     energies = tuple(jnp.stack([jnp.broadcast_to(e, shape) for e in each]) for each in zip(*rows, strict=True))
-    return Tables(grid, values, energies, windows, opaque, azimuths, steps)
+    return Tables(grid, values, energies, windows, turns, opaque, azimuths, steps)
 
 
 def _passed(window: Window, region: Region) -> Array:
     """What a smooth interface passes of light along the nodes, (channels or 1, nodes)."""
     return jnp.stack(window.cross((region.sine, jnp.zeros_like(region.sine), region.cosine))[1])
+
+
+def _turns_along(turns: Turns, region: Region) -> Array:
+    """`Turns.count` along the nodes, (channels, nodes)."""
+    counted = turns.count((region.sine, jnp.zeros_like(region.sine), region.cosine))
+    return jnp.where(region.exists, jnp.stack(counted), 1.0)
 
 
 def _values(
@@ -150,8 +165,11 @@ def _values(
     present = [quadrant for quadrant in quadrants if quadrant is not None]
     if not present:
         return None
-    zero = jnp.zeros_like(present[0])
-    together = jnp.concatenate([zero if quadrant is None else quadrant for quadrant in quadrants], axis=1)
+    shape = (max(quadrant.shape[0] for quadrant in present), *present[0].shape[1:])
+    zero = jnp.zeros(shape, present[0].dtype)
+    together = jnp.concatenate(
+        [zero if quadrant is None else jnp.broadcast_to(quadrant, shape) for quadrant in quadrants], axis=1
+    )
     return tuple(together[c] for c in range(together.shape[0]))
 
 
@@ -176,8 +194,9 @@ def _quadrant(
         values = mean * (jnp.repeat(out.region.cosine, count)[:, None] + jnp.repeat(into.region.cosine, count))
     else:
         leaving, entering = (jnp.repeat(_share_passed(end), count, axis=-1) for end in (out, into))
-        shares = leaving[:, None, :, None] * entering[:, None, None, :]
-        values = safe_div(mean, jnp.broadcast_to(shares, mean.shape))
+        both = leaving[:, None, :, None] * entering[:, None, None, :]
+        shape = jnp.broadcast_shapes(mean.shape, both.shape)
+        values = safe_div(jnp.broadcast_to(mean, shape), jnp.broadcast_to(both, shape))
     fine = _lift_values(values, out, into)
     if steps is None:
         return fine[:, 0]
@@ -185,10 +204,12 @@ def _quadrant(
 
 
 def _share_passed(end: _End) -> Array:
-    """What a smooth interface passes along every node, (channels or 1, nodes), 1 where there is none."""
+    """What a smooth interface passes along every node, all turns counted, (channels or 1, nodes); 1 where there is
+    none."""
     if end.passed is None:
         return jnp.ones_like(end.region.cosine)[None]
-    return jnp.where(end.region.exists, end.passed, 0.0)
+    passed = jnp.where(end.region.exists, end.passed, 0.0)
+    return passed if end.turns is None else passed * end.turns
 
 
 def _energy(flux: Operator, onward: Channels | None, share: Channels | None, end: _End) -> Array:
@@ -296,7 +317,8 @@ def read_rest(tables: Tables, wi: Vector, wo: Vector, side: Side) -> Channels:
     if tables.steps is not None:
         axes.append(_azimuth_points(into, out, tables.steps))
     factors = tuple(jnp.where(valid, scale * weight, 0.0) for weight in _weight(tables, out, into, quadrant))
-    return multiply(factors, _read(tables, tables.values, start, axes, [(out, ior_out), (into, ior_into)]))
+    found = _read(tables, tables.values, start, axes, [(out, ior_out), (into, ior_into)])
+    return multiply(factors, found)
 
 
 def _weight(tables: Tables, out: Vector, into: Vector, quadrant: Array) -> Channels:
@@ -304,19 +326,23 @@ def _weight(tables: Tables, out: Vector, into: Vector, quadrant: Array) -> Chann
     sum_of_cosines = 1.0 / (out[2] + into[2])
     if all(window is None for window in tables.windows):
         return (sum_of_cosines,)
-    top, bottom = (None if window is None else [window.cross(w)[1] for w in (out, into)] for window in tables.windows)
+    top, bottom = (
+        None if window is None else [_entering(window, turns, w) for w in (out, into)]
+        for window, turns in zip(tables.windows, tables.turns, strict=True)
+    )
     above = (sum_of_cosines,) if top is None else multiply(*top)
     if tables.opaque:
         return above
     below = (sum_of_cosines,) if bottom is None else multiply(*bottom)
-    one: Channels = (jnp.ones_like(sum_of_cosines),)
+    one = (jnp.ones_like(sum_of_cosines),)
     across = multiply(one if bottom is None else bottom[0], one if top is None else top[1])
-    return map_channels(
-        lambda *kinds: jnp.where(quadrant == 0, kinds[0], jnp.where(quadrant == 1, kinds[1], kinds[2])),
-        above,
-        below,
-        across,
-    )
+    return select_channels(quadrant == 0, above, select_channels(quadrant == 1, below, across))
+
+
+def _entering(window: Window, turns: Turns | None, w: Vector) -> Channels:
+    """What a smooth interface passes of light along w, all turns counted."""
+    passed = window.cross(w)[1]
+    return passed if turns is None else multiply(passed, turns.count(w))
 
 
 def read_energies(tables: Tables, wi: Vector) -> list[Channels]:
@@ -333,6 +359,10 @@ def read_energies(tables: Tables, wi: Vector) -> list[Channels]:
         _read(tables, tuple(jnp.moveaxis(table, 1, 0)), row * table.shape[-1], axes, [(wi, ior)])
         for table in tables.energies
     ]
+    for turns, lit in zip(tables.turns, (row == 0, row == 1), strict=True):
+        if turns is not None:
+            one = (jnp.ones_like(wi[2]),)
+            found = [multiply(energies, select_channels(lit, turns.count(wi), one)) for energies in found]
     return [tuple(jnp.where(valid, energy, 0.0) for energy in energies) for energies in found]
 
 

@@ -90,6 +90,7 @@ from layerjax.transport.specular import (
     has_specular,
     is_smooth,
     sample_with_deltas,
+    smooth_turns,
     smooth_window,
     specular_draws,
 )
@@ -594,7 +595,10 @@ def _tables(
     onward = None if once is None else partial(peak_probability, first, once)
     outer = faces if first.layered else None
     windows = smooth_window(stack, upward=False), smooth_window(stack, upward=True)
-    return make_tables(grid, whole, rest, plan.azimuths, stack.base is not None, met, outer, onward, windows)
+    above, below = (smooth_turns(stack, upward=up) if plan.azimuths is None else None for up in (False, True))
+    return make_tables(
+        grid, whole, rest, plan.azimuths, stack.base is not None, met, outer, onward, windows, (above, below)
+    )
 
 
 def _requested_values(stack: Stack, elements: list[Any], known: KnownDirections, plan: Plan) -> RequestedValues:
