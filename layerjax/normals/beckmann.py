@@ -76,7 +76,7 @@ def _slope_seen(cosine: Array, sine: Array, u: Array) -> Array:
         less = found < target
         low, high = jnp.where(less, level, low), jnp.where(less, high, level)
         onward = level + (target - found) / clamp_min(slope, 1e-30)
-        return low, high, jnp.where((onward > low) & (onward < high), onward, 0.5 * (low + high))
+        return low, high, jnp.where((onward >= low) & (onward <= high), onward, 0.5 * (low + high))
 
     at, target = jax.lax.stop_gradient((cosine, sine)), jax.lax.stop_gradient(wanted)
     first = jax.lax.stop_gradient(_clip_level(-jnp.ones_like(last)))
