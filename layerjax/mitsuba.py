@@ -29,6 +29,7 @@ from layerjax.evaluate import draw, evaluate, pdf, specular, unscattered
 from layerjax.mixture import Mixture, stacks_of
 from layerjax.preparation import choose_transport, prepare
 from layerjax.stack import Interface, Stack, require_numbers, simplify
+from layerjax.transport.adding_doubling.resolution import is_tilted
 from layerjax.transport.specular import has_specular
 
 NAME = "layerjax"
@@ -93,6 +94,7 @@ class PluginMaterial:
         self.is_open = bool(layers)
         self.has_null = not all(interfaces)
         self.has_delta = any(map(has_specular, parts))
+        self.is_anisotropic = any(is_tilted(part) for one in parts for part in (*one.layers, one.base))
         self.eta = next((float(found[-1]) for found in reversed(interfaces) if found), 1.0)
 
     def update(self) -> None:
@@ -221,7 +223,8 @@ def _components(material: PluginMaterial) -> list[int]:
     kinds += [flags.Null] if material.has_null else []
     if material.has_delta:
         kinds += [flags.DeltaReflection, flags.DeltaTransmission] if material.is_open else [flags.DeltaReflection]
-    return [kind | flags.FrontSide | flags.BackSide for kind in kinds]
+    turned = flags.Anisotropic if material.is_anisotropic else 0
+    return [kind | flags.FrontSide | flags.BackSide | turned for kind in kinds]
 
 
 def _scene_material(properties: Any) -> PluginMaterial:

@@ -1,8 +1,8 @@
 """Facets with two widths, as of a brushed metal: isotropic facets of width 1, stretched along two axes.
 
-Slopes of GGX and Beckmann facets are those of width 1 times alpha along the tangent and alpha_y across it (Heitz 2014,
-Sec. 5.3). So density, projected area and visible normals are those of width 1 along stretched directions; what the
-stretch does to solid angle is a factor.
+Slopes of facets are those of width 1 times alpha along the tangent and alpha_y across it (Heitz 2014). So density,
+projected area and visible normals are those of width 1 along stretched directions; what the stretch does to solid angle
+is a factor.
 """
 
 from typing import Any

@@ -56,10 +56,57 @@ STRUCTURES = {
 }
 """Name: how each number is drawn, and the stack of them."""
 
+FILM = (uniform(1.35, 2.3), uniform(20.0, 600.0))
+
+OTHER_INTERFACES = {
+    "smooth varnish": ((INDEX, PAINT), lambda p: lj.Stack([lj.Interface(p[0])], lj.Lambertian(p[1]))),
+    "smooth coat on metal": (
+        (INDEX, *METAL, INNER),
+        lambda p: lj.Stack([lj.Interface(p[0])], lj.Conductor(p[1], p[2], p[3])),
+    ),
+    "hazy pane": (
+        (INDEX, DEPTH, ALBEDO, G),
+        lambda p: lj.Stack([lj.Interface(p[0]), lj.Medium(p[1], p[2], HenyeyGreenstein(p[3])), lj.Interface(1.0)]),
+    ),
+    "haze on a mirror": (
+        (INDEX, ROUGH, DEPTH, ALBEDO, G, *METAL),
+        lambda p: lj.Stack(
+            [lj.Interface(p[0], p[1]), lj.Medium(p[2], p[3], HenyeyGreenstein(p[4]))], lj.Conductor(p[5], p[6])
+        ),
+    ),
+    "Beckmann coat": (
+        (INDEX, ROUGH, *METAL, INNER),
+        lambda p: lj.Stack([lj.Interface(p[0], p[1], "beckmann")], lj.Conductor(p[2], p[3], p[4], "beckmann")),
+    ),
+    "Student-t coat": (
+        (INDEX, ROUGH, uniform(1.8, 10.0), PAINT),
+        lambda p: lj.Stack([lj.Interface(p[0], p[1], "gtr", gamma=p[2])], lj.Lambertian(p[3])),
+    ),
+    "filmed coat": (
+        (INDEX, ROUGH, *FILM, PAINT),
+        lambda p: lj.Stack([lj.Interface(p[0], p[1], film=lj.ThinFilm(p[2], p[3], 550.0))], lj.Lambertian(p[4])),
+    ),
+    "filmed metal": (
+        (INDEX, ROUGH, *METAL, INNER, *FILM),
+        lambda p: lj.Stack(
+            [lj.Interface(p[0], p[1])], lj.Conductor(p[2], p[3], p[4], film=lj.ThinFilm(p[5], p[6], 550.0))
+        ),
+    ),
+    "brushed metal": (
+        (INDEX, *METAL, logarithmic(0.3, 0.8), logarithmic(0.3, 0.8), uniform(-1.5, 1.5)),
+        lambda p: lj.Stack([lj.Interface(p[0])], lj.Conductor(p[1], p[2], p[3], alpha_y=p[4], tangent=p[5])),
+    ),
+    "brushed coat": (
+        (INDEX, logarithmic(0.1, 0.8), logarithmic(0.1, 0.8), uniform(-1.5, 1.5), PAINT),
+        lambda p: lj.Stack([lj.Interface(p[0], p[1], alpha_y=p[2], tangent=p[3])], lj.Lambertian(p[4])),
+    ),
+}
+"""The same of smooth and brushed interfaces, of other normals, and with films."""
+
 
 def drawn(kind, seed):
     random = np.random.default_rng([seed, len(kind)])
-    return jnp.asarray([draw(random) for draw in STRUCTURES[kind][0]])
+    return jnp.asarray([draw(random) for draw in (STRUCTURES | OTHER_INTERFACES)[kind][0]])
 
 
 def lengths(stack, numbers):

@@ -27,6 +27,7 @@ STACKS: dict[str, tuple[lj.Stack | lj.Mixture, Any]] = {
         lj.Stack([lj.Medium(0.7, 0.9, lj.SGGX("surface", 0.4, (0.3, 0.2, 0.9)), 0.1)], lj.OrenNayar(0.5, 0.4)),
         lj.SpongeCake(),
     ),
+    "brushed": (lj.Stack([], lj.Conductor(0.2, 3.9, 0.15, alpha_y=0.4, tangent=0.3)), "auto"),
     "sheet": (SHEET, lj.SingleScattering()),
     "glass": (GLASS, SOLVER),
     "pane": (lj.Stack([lj.Interface(1.5, 0.2), lj.Medium(0.3, 0.8), lj.Interface(1.0, 0.3)]), SOLVER),

@@ -6,7 +6,7 @@ import pytest
 
 import layerjax as lj
 from layerjax.numerical_error import neighbours
-from tests.helpers.random_stacks import STRUCTURES, drawn
+from tests.helpers.random_stacks import OTHER_INTERFACES, STRUCTURES, drawn
 
 POLAR, AZIMUTH = np.radians([5.0, 30.0, 55.0, 75.0]), np.radians([0.0, 60.0, 150.0, 180.0])
 WI, WO = np.broadcast_arrays(
@@ -48,6 +48,18 @@ def test_errors_cover_random_stacks(kind, part):
     found = []
     for seed in range(100 + part, 120, 4):
         stack = STRUCTURES[kind][1](drawn(kind, seed))
+        chosen = lj.choose_transport(stack, WI, WO)
+        found.append(in_errors(stack, chosen, chosen.finer().finer().finer()))
+    assert np.mean(np.concatenate(found) <= 4.0) >= 0.99
+    assert np.max(np.concatenate(found)) < 8.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", OTHER_INTERFACES)
+def test_errors_cover_random_stacks_of_other_interfaces(kind):
+    found = []
+    for seed in range(100, 103):
+        stack = OTHER_INTERFACES[kind][1](drawn(kind, seed))
         chosen = lj.choose_transport(stack, WI, WO)
         found.append(in_errors(stack, chosen, chosen.finer().finer().finer()))
     assert np.mean(np.concatenate(found) <= 4.0) >= 0.99

@@ -41,7 +41,7 @@ REFUSALS = (
     ("predict saved --incidence 30 --out new.txt", ".csv"),
     ("predict saved --incidence 30 --out new.csv --select azimuth=0", "--select is given without --score"),
     ("predict saved --score data.csv --azimuth 90", "--azimuth is given without --incidence"),
-    ("render fabrik --out a.png", "neither a .toml file nor a material of the gallery: window_shade"),
+    ("render fabrik --out a.png", "neither a .toml file nor a material of the gallery: brushed_aluminium"),
     ("fit-many scans", "no stack is given"),
 )
 
