@@ -280,6 +280,6 @@ def _mirror_rule(wi: Vector, alpha: Array, nodes: int, *, tails: bool = False) -
 
 
 def _last_angle(kappa: Array) -> Array:
-    """From the normal, beyond which there are no vMF normals but for what `TAIL` says."""
+    """The angle from the normal beyond which there are no vMF normals but for what `TAIL` says."""
     drop = clamp_max(TAIL * TAIL / kappa, 1.0)
     return 2.0 * jnp.arctan2(safe_sqrt(0.5 * drop), safe_sqrt(1.0 - 0.5 * drop))

@@ -15,7 +15,7 @@ Films = tuple[fresnel.Film | None, ...]
 """The film on an interface, for all channels or one for each; None: there is none."""
 
 BARE: Films = (None,)
-"""Of an interface without a film."""
+"""The films of an interface without any."""
 
 
 class ThinFilm(ReprModule):

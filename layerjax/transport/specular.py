@@ -31,16 +31,16 @@ class Face(eqx.Module):
     """A smooth interface as light meets it: the indices before and behind, and the film on it."""
 
     before: Array
-    behind: Array
+    after: Array
     film: ThinFilm | None
 
     @property
     def ratio(self) -> Array:
         """Index behind over index before."""
-        return self.behind / self.before
+        return self.after / self.before
 
     def reflectance(self, cosine: Array, refracted: Array, transmits: Array) -> Channels:
-        """By the cosine of incidence, that of refraction, and whether there is such light."""
+        """Reflectance by the cosine of incidence, that of refraction, and whether there is such light."""
         films = films_of(self.film, self.before)
         return tuple(fresnel.dielectric_towards(cosine, self.ratio, refracted, transmits, film) for film in films)
 
@@ -222,11 +222,11 @@ def _behind_face(levels: Channels, reflected: Channels, passed: Channels) -> tup
 class Turns(eqx.Module):
     """All the times that light which entered through a smooth interface is mirrored between that and what lies behind.
 
-    behind: what mirrors light back, without a base; turned: see `ray_shares`.
+    layers: what mirrors light back, without a base; turned: see `ray_shares`.
     """
 
     face: Face
-    behind: tuple[Crossed, ...]
+    layers: tuple[Crossed, ...]
     turned: bool = eqx.field(static=True)
 
     def count(self, w: Vector) -> Channels:
@@ -234,7 +234,7 @@ class Turns(eqx.Module):
         w = sanitise(w, jnp.abs(w[2]) > horizon(w[2].dtype))
         there, exists = bend(w, self.face.ratio)
         levels = self.face.reflectance(jnp.abs(w[2]), jnp.abs(there[2]), exists)
-        reflected, _ = ray_shares(self.behind, self.face.before, None, w, turned=self.turned)
+        reflected, _ = ray_shares(self.layers, self.face.before, None, w, turned=self.turned)
         return map_channels(
             lambda level, part: 1.0 / clamp_min(1.0 - jnp.where(exists, level, 0.0) * part, LEAST_LOSS),
             levels,
@@ -273,8 +273,8 @@ def _window(crossed: Sequence[Crossed], *, turned: bool) -> Window | None:
         if isinstance(layer, Medium):
             parts.append(layer)
         elif layer.is_smooth:
-            before, behind = (below, above) if turned else (above, below)
-            parts.append(Face(before, behind, layer.film))
+            before, after = (below, above) if turned else (above, below)
+            parts.append(Face(before, after, layer.film))
         else:
             return None
     return Window(tuple(parts))

@@ -156,7 +156,7 @@ def evaluate_ballistic(state: Ballistic, wi: Vector, wo: Vector) -> Channels:
 
 
 def _transmitted_bsdf(state: Ballistic, cosine_i: Array, cosine_o: Array, azimuth: Array) -> Channels:
-    """BSDF of pairs, see `_film_transmitted`; once for each channel that films tell apart."""
+    """BSDF of pairs, see `_film_transmitted`; once for each channel that films distinguish."""
     films = [films_of(face.film) for face in (state.upper, state.lower)]
     if films == [BARE, BARE]:
         return _film_transmitted(state, (None, None), cosine_i, cosine_o, azimuth)

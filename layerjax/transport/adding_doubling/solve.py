@@ -174,7 +174,7 @@ def _interfaces(
     dtype = indices[0].dtype
 
     def join(layer: Interface, function: Any, options: Any, numbers: Any, along: Any, step: Any = None) -> Layer:
-        """An element for each channel that a film tells apart, joined along the axis of the channels."""
+        """An element for each channel that a film distinguishes, joined along the axis of the channels."""
         films = films_of(layer.film)
         found = [make(function, options, (*numbers, film), along, dtype, step) for film in films]
         return found[0] if len(found) == 1 else jax.tree.map(lambda *parts: jnp.concatenate(parts), *found)

@@ -86,7 +86,7 @@ def _widths(scene: Scene, surface: Array | None, distribution: Distribution) -> 
 
 
 def _gamma(scene: Scene, surface: Array | None) -> Array:
-    """Of the slopes of an interface; a stand-in where others have none."""
+    """Exponent of the slopes of an interface; a stand-in where others have none."""
     return choose(surface, [2.0 if face.gamma is None else face.gamma for face in scene.interfaces])
 
 
