@@ -28,6 +28,11 @@ LEAST_FACETS, LEAST_OF_SEVERAL = 16, 24
 """Points of the dense quadrature of visible normals in either direction, at least (`dense_refracted_rays`): of a single
 interface, and where there are several, between which light continues."""
 
+DENSER = 3
+"""Times as many in either direction where a mirror sends light back: it passes the same facets twice, and nodes must
+not distinguish them. Index 1.27 and alpha 0.4 over a mirror, at 75 degrees: 4.82 at 24 nodes, 21.7 at 96, without; the
+walk has 4.776 +- 0.005."""
+
 CRITICAL = 7.5
 """Times the distance between facets: half the width over which the critical angle of refraction is rounded off."""
 
@@ -168,12 +173,12 @@ def facet_spacing(points: int, normals: Normals) -> Array:
 
 def polar_count(grid: Grid) -> int:
     """Points from pole to rim of the dense quadrature of visible normals."""
-    return max(_least_points(grid), 3 * grid.nodes // 2)
+    return max(_least_points(grid), 3 * grid.nodes // 2) * (DENSER if grid.mirrored else 1)
 
 
 def azimuth_count(grid: Grid, modes: int) -> int:
     """Azimuths at each of them."""
-    return max(_least_points(grid), 3 * modes // 4)
+    return max(_least_points(grid), 3 * modes // 4) * (DENSER if grid.mirrored else 1)
 
 
 def _least_points(grid: Grid) -> int:

@@ -71,13 +71,15 @@ class Region(eqx.Module):
 
 class Grid(eqx.Module):
     """Nodes of all panels in s, and the regions from top to bottom. common: whether all regions have the same nodes,
-    also in a panel that regions of slightly different indices share."""
+    also in a panel that regions of slightly different indices share. mirrored: whether light that an interface passes
+    comes back to it as it is."""
 
     edges: Array
     least_width: Array
     regions: tuple[Region, ...]
     nodes: int = eqx.field(static=True)
     common: bool = eqx.field(static=True, default=False)
+    mirrored: bool = eqx.field(static=True, default=False)
 
     @property
     def interfaces(self) -> int:
@@ -112,7 +114,13 @@ def join_regions(first: Region, second: Region) -> Region:
 
 
 def make_grid(
-    indices: Sequence[Any], ranks: tuple[int, ...] | None, nodes: int, dtype: Any, *, common: bool = False
+    indices: Sequence[Any],
+    ranks: tuple[int, ...] | None,
+    nodes: int,
+    dtype: Any,
+    *,
+    common: bool = False,
+    mirrored: bool = False,
 ) -> Grid:
     """Grid for regions of these refractive indices.
 
@@ -121,6 +129,7 @@ def make_grid(
         ranks: the place of each region's index among the distinct ones, if that is known; None: found by sorting.
         nodes: nodes a panel.
         common: see `Grid`; for smooth interfaces, which refract nodes to nodes.
+        mirrored: see `Grid`.
     """
     squares = jnp.stack([jnp.asarray(n, dtype) ** 2 for n in indices])
     if ranks is None:
@@ -129,7 +138,7 @@ def make_grid(
         edges = jnp.stack([squares[ranks.index(rank)] for rank in range(max(ranks) + 1)])
     x, w = (jnp.asarray(array, dtype) for array in gauss_legendre(nodes))
     least_width = (MERGE_SHARE * x[0]) ** 2
-    grid = Grid(_merge_edges(edges, least_width), least_width, (), nodes, common)
+    grid = Grid(_merge_edges(edges, least_width), least_width, (), nodes, common, mirrored)
     beyond = least_width if common else 0.0
     x2 = (x * x)[None]
     regions = []

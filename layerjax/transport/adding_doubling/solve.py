@@ -57,15 +57,18 @@ class Plan(eqx.Module):
     multiple: bool = eqx.field(static=True)
     common: bool = eqx.field(static=True, default=False)
     """Whether all regions have the same nodes, which smooth interfaces refract to each other."""
+    mirrored: bool = eqx.field(static=True, default=False)
+    """Whether a smooth surface sends back what rough interfaces let pass."""
 
 
 def make_plan(stack: Stack, resolution: Resolution, multiple: bool) -> Plan:
     """The plan for a simplified stack."""
     common = any(map(is_smooth, stack.layers))
+    mirrored = common or is_smooth(stack.base)
     if has_tilted(stack):
         nodes, azimuths = resolution.ordinates
-        return Plan(nodes, azimuths // 2 + 1, azimuths, ranks(stack), multiple, common)
-    return Plan(resolution.nodes, resolution.modes, None, ranks(stack), multiple, common)
+        return Plan(nodes, azimuths // 2 + 1, azimuths, ranks(stack), multiple, common, mirrored)
+    return Plan(resolution.nodes, resolution.modes, None, ranks(stack), multiple, common, mirrored)
 
 
 def solve(
@@ -150,7 +153,7 @@ def without_base(stack: Stack) -> Layers:
 
 
 def _grid(plan: Plan, indices: Scalars, dtype: Any) -> Grid:
-    return make_grid(indices, plan.ranks, plan.nodes, dtype, common=plan.common)
+    return make_grid(indices, plan.ranks, plan.nodes, dtype, common=plan.common, mirrored=plan.mirrored)
 
 
 def _indices(stack: Stack, dtype: Any) -> Scalars:
