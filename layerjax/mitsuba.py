@@ -28,8 +28,7 @@ from layerjax._shapes import map_shape
 from layerjax.evaluate import draw, evaluate, pdf, specular, unscattered
 from layerjax.mixture import Mixture, stacks_of
 from layerjax.preparation import choose_transport, prepare
-from layerjax.stack import Interface, Stack, require_numbers, simplify
-from layerjax.transport.adding_doubling.resolution import is_tilted
+from layerjax.stack import Interface, Stack, is_tilted, require_numbers, simplify
 from layerjax.transport.specular import has_specular
 
 NAME = "layerjax"

@@ -21,8 +21,8 @@ from layerjax._repr import ReprModule, describe
 from layerjax._shapes import channel_count
 from layerjax.channels import Channels, per_channel
 from layerjax.directions import Vector
-from layerjax.normals.facets import Distribution, check_facets, width_of
-from layerjax.normals.widths import Width, azimuth_of_tangent
+from layerjax.normals.facets import Distribution, Facets, check_facets
+from layerjax.normals.widths import azimuth_of_tangent
 from layerjax.phase import HenyeyGreenstein, PhaseFunction
 from layerjax.surfaces import Conductor, Surface, ThinFilm
 
@@ -30,7 +30,7 @@ LEAST_EXTINCTION = 1e-10
 """In 1/mm, stands for 0 where derivatives by the coefficients of a turbid medium may be needed."""
 
 
-class Interface(ReprModule):
+class Interface(Facets, ReprModule):
     """Dielectric interface: rough, of microfacets (Walter et al. 2007), or smooth.
 
     With Fresnel term F, distribution of normals D and masking G = G1(wi) G1(wo), reflection and transmission are::
@@ -90,16 +90,6 @@ class Interface(ReprModule):
     def __check_init__(self) -> None:
         check_facets("Interface", self.distribution, self.alpha, self.alpha_y, self.tangent, self.gamma)
         require_kind("Interface.film", self.film, ThinFilm, None)
-
-    @property
-    def width(self) -> Width:
-        """Of its facets: one number, or two along and across a tangent; with gamma, where that is given."""
-        return width_of(self.alpha, self.alpha_y, self.tangent, self.gamma)
-
-    @property
-    def is_anisotropic(self) -> bool:
-        """Whether it has two widths, by structure."""
-        return self.alpha_y is not None
 
     @property
     def is_smooth(self) -> bool:
@@ -297,6 +287,14 @@ def make_constants_static(stack: Stack) -> Stack:
     """The same stack with albedos and f0 that are 0 or 1 for all channels as Python floats: known also under `jit`."""
     layers = tuple(_make_layer_static(layer) for layer in stack.layers)
     return eqx.tree_at(lambda s: s.layers, stack, layers)
+
+
+def is_tilted(part: Any) -> bool:
+    """Whether a layer or a base is not symmetric about the normal, as far as is known while tracing: a medium with an
+    axis, or facets of two widths."""
+    if isinstance(part, Interface | Conductor):
+        return part.is_anisotropic
+    return isinstance(part, Medium | TurbidMedium) and not part.phase.is_axisymmetric
 
 
 def media_of(stack: Stack) -> list[Medium]:

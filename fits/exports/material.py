@@ -11,6 +11,7 @@ from fits.data.geometry import Floats
 from fits.progress import Progress, silent
 from layerjax.mixture import stacks_of
 from layerjax.phase.contract import Flakes
+from layerjax.stack import is_tilted
 
 BATCH = 1 << 16
 """Pairs of directions that are evaluated at a time."""
@@ -85,10 +86,7 @@ class Material:
     @property
     def isotropic(self) -> bool:
         """Whether the BSDF is invariant to rotations about the normal."""
-        surfaces = [face for part in self.parts for face in (*part.layers, part.base)]
-        facets = [face for face in surfaces if isinstance(face, lj.Interface | lj.Conductor)]
-        media = [layer for part in self.parts for layer in part.layers if not isinstance(layer, lj.Interface)]
-        return all(m.phase.is_axisymmetric for m in media) and not any(face.is_anisotropic for face in facets)
+        return not any(is_tilted(one) for part in self.parts for one in (*part.layers, part.base))
 
     @property
     def turns_by_half(self) -> bool:

@@ -22,7 +22,7 @@ from layerjax.directions import Vector
 from layerjax.normals import vmf
 from layerjax.normals.facets import Distribution, density, twice_projected_area
 from layerjax.normals.ggx import ggx_masking
-from layerjax.normals.widths import OneWidth, Tailed, narrowest
+from layerjax.normals.widths import OneWidth, StudentWidth, narrowest
 from layerjax.quadrature import gauss_legendre
 
 STRETCH_LIMIT = 3.0
@@ -145,7 +145,7 @@ def visible_normals(
     mu, sin_w = cosine[:, None], sine[:, None]
     # tan(psi/2) is squeezed; in terms of v, the tangent of half of the angle that has it then
     x, w = (jnp.asarray(array, mu.dtype) for array in gauss_legendre(azimuths))
-    if isinstance(width, Tailed):
+    if isinstance(width, StudentWidth):
         x, w = _crowd_at_end(x, w, width.gamma)
     length, v = circles.end, circles.end[..., None] * x
     if circles.start is not None:

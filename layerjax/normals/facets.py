@@ -23,7 +23,7 @@ from layerjax.normals.ggx import ggx_area, ggx_density, ggx_masking, ggx_sample
 from layerjax.normals.sggx import radii
 from layerjax.normals.student import student_area, student_density, student_sample
 from layerjax.normals.widths import (
-    Tailed,
+    StudentWidth,
     Width,
     Widths,
     from_unit_width,
@@ -37,7 +37,7 @@ from layerjax.quadrature import Nodes, flake_rule, panels
 
 Distribution = Literal["ggx", "beckmann", "vmf", "gtr"]
 """Normals of Walter et al. 2007, the first two, von Mises-Fisher ones with kappa = 2 / alpha^2 (Guo et al. 2015), or
-those of Student-t slopes, whose width is a `Tailed` (Ribardiere et al. 2017)."""
+those of Student-t slopes, whose width is a `StudentWidth` (Ribardiere et al. 2017)."""
 
 MOST_SLOPE = 0.999
 """Slope of the density of azimuths, at most: at 1 the rim would have density 0."""
@@ -75,7 +75,26 @@ def width_of(alpha: Any, alpha_y: Any, tangent: Any, gamma: Any = None) -> Any:
     """The width or the widths of facets, by their parameters."""
     if alpha_y is not None:
         return Widths(alpha, alpha_y, tangent, gamma)
-    return alpha if gamma is None else Tailed(alpha, gamma)
+    return alpha if gamma is None else StudentWidth(alpha, gamma)
+
+
+class Facets:
+    """What the facets of interfaces and metals have in common, by the parameters that both classes have."""
+
+    alpha: Any
+    alpha_y: Any
+    tangent: Any
+    gamma: Any
+
+    @property
+    def width(self) -> Width:
+        """Of its facets: one number, or two along and across a tangent; with gamma, where that is given."""
+        return width_of(self.alpha, self.alpha_y, self.tangent, self.gamma)
+
+    @property
+    def is_anisotropic(self) -> bool:
+        """Whether it has two widths, by structure."""
+        return self.alpha_y is not None
 
 
 def density(m: Vector, alpha: Width, distribution: Distribution) -> Array:
@@ -85,13 +104,13 @@ def density(m: Vector, alpha: Width, distribution: Distribution) -> Array:
         size = length(v)
         unit = density(scale(1.0 / size, v), unit_width(alpha, size), distribution)
         return unit / (size * size) / (alpha.alpha * size) / (alpha.alpha_y * size)
-    if isinstance(alpha, Tailed):
+    if isinstance(alpha, StudentWidth):
         return student_density(m, alpha.alpha, alpha.gamma)
     if distribution == "ggx":
         return ggx_density(m, alpha)
     if distribution == "beckmann":
         return beckmann_density(m, alpha)
-    assert distribution == "vmf"  # "gtr" comes with a `Tailed`
+    assert distribution == "vmf"  # "gtr" comes with a `StudentWidth`
     return vmf.hemisphere_density(m, vmf.concentration(alpha))
 
 
@@ -106,13 +125,13 @@ def twice_projected_area(cosine: Array, w: Vector, alpha: Width, distribution: D
         if distribution == "ggx":
             return cosine + length(v)
         return twice_projected_area(cosine, v, unit_width(alpha, cosine), distribution)
-    if isinstance(alpha, Tailed):
+    if isinstance(alpha, StudentWidth):
         return student_area(cosine, w, alpha.alpha, alpha.gamma)
     if distribution == "ggx":
         return cosine + ggx_area(w, alpha)
     if distribution == "beckmann":
         return beckmann_area(cosine, w, alpha)
-    assert distribution == "vmf"  # "gtr" comes with a `Tailed`
+    assert distribution == "vmf"  # "gtr" comes with a `StudentWidth`
     return 2.0 / vmf.masking_over_cosine(cosine, vmf.concentration(alpha))
 
 
@@ -126,13 +145,13 @@ def sample(wi: Vector, alpha: Width, u1: Array, u2: Array, distribution: Distrib
     if isinstance(alpha, Widths):
         unit = sample(normalize(stretch(wi, alpha)), unit_width(alpha, wi[2]), u1, u2, distribution)
         return from_unit_width(unit, alpha)
-    if isinstance(alpha, Tailed):
+    if isinstance(alpha, StudentWidth):
         return student_sample(wi, alpha.alpha, alpha.gamma, u1, u2)
     if distribution == "ggx":
         return ggx_sample(wi, alpha, u1, u2)
     if distribution == "beckmann":
         return beckmann_sample(wi, alpha, u1, u2)
-    assert distribution == "vmf"  # "gtr" comes with a `Tailed`
+    assert distribution == "vmf"  # "gtr" comes with a `StudentWidth`
     normal = vmf.hemisphere_sample(vmf.concentration(alpha), u1, jnp.zeros_like(u2))
     planar, x, y = _plane(wi)
     sine, cosine = safe_sqrt(normal[0] * normal[0] + normal[1] * normal[1]), normal[2]
@@ -146,13 +165,13 @@ def sample(wi: Vector, alpha: Width, u1: Array, u2: Array, distribution: Distrib
 
 def reflection_pdf(h: Vector, wi: Vector, alpha: Width, distribution: Distribution = "ggx") -> Array:
     """Density, 1/sr, of directions mirrored at facets that `sample` draws, by their half vector with wi."""
-    if isinstance(alpha, Widths | Tailed):
+    if isinstance(alpha, Widths | StudentWidth):
         return density(h, alpha, distribution) / (2.0 * twice_projected_area(wi[2], wi, alpha, distribution))
     if distribution == "ggx":
         return ggx_density(h, alpha) * ggx_masking(wi, alpha) / (4.0 * wi[2])
     if distribution == "beckmann":
         return beckmann_density(h, alpha) / (2.0 * beckmann_area(wi[2], wi, alpha))
-    assert distribution == "vmf"  # "gtr" comes with a `Tailed`
+    assert distribution == "vmf"  # "gtr" comes with a `StudentWidth`
     kappa = vmf.concentration(alpha)
     drawn = _share_drawn(wi, h, kappa) * vmf.hemisphere_norm(kappa) * vmf.hemisphere_density(h, kappa)
     return drawn / (4.0 * clamp_min(dot(wi, h), LEAST_WEIGHT))
@@ -172,7 +191,7 @@ def rule(wi: Vector, alpha: Width, nodes: int, distribution: Distribution) -> No
     """Quadrature over the directions above the horizon that the facets mirror wi to (see `layerjax.quadrature`)."""
     if isinstance(alpha, Widths):
         return _drawn_rule(wi, alpha, nodes, distribution)
-    if isinstance(alpha, Tailed):
+    if isinstance(alpha, StudentWidth):
         return _mirror_rule(wi, alpha.alpha, nodes, tails=True)
     if distribution == "ggx":
         return flake_rule(wi, *radii("surface", alpha), None, nodes)[0]

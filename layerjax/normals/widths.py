@@ -23,7 +23,7 @@ LEAST_TANGENT = 1e-6
 """Length of what a tangent has in the plane of the surface."""
 
 
-class Tailed(eqx.Module):
+class StudentWidth(eqx.Module):
     """A width, and the exponent gamma of Student-t slopes (`layerjax.normals.student`)."""
 
     alpha: Array
@@ -31,8 +31,10 @@ class Tailed(eqx.Module):
 
 
 class Widths(eqx.Module):
-    """Widths along a tangent and across it, and the azimuth of the tangent, in radians; None: 0. gamma: of a `Tailed`,
-    else None."""
+    """Widths along a tangent and across it, and the azimuth of the tangent, in radians (None: 0).
+
+    gamma: exponent of Student-t slopes, None of others.
+    """
 
     alpha: Array
     alpha_y: Array
@@ -40,7 +42,7 @@ class Widths(eqx.Module):
     gamma: Array | None = None
 
 
-OneWidth = Array | Tailed
+OneWidth = Array | StudentWidth
 """One width, with all that its distribution needs."""
 
 Width = OneWidth | Widths
@@ -49,21 +51,21 @@ Width = OneWidth | Widths
 
 def narrowest(width: Width) -> Array:
     """The smaller of the widths."""
-    if isinstance(width, Tailed):
+    if isinstance(width, StudentWidth):
         return jnp.asarray(width.alpha)
     return jnp.minimum(width.alpha, width.alpha_y) if isinstance(width, Widths) else jnp.asarray(width)
 
 
 def cast_width(width: OneWidth, dtype: Any) -> OneWidth:
     """A width in a floating type."""
-    if isinstance(width, Tailed):
-        return Tailed(jnp.asarray(width.alpha, dtype), jnp.asarray(width.gamma, dtype))
+    if isinstance(width, StudentWidth):
+        return StudentWidth(jnp.asarray(width.alpha, dtype), jnp.asarray(width.gamma, dtype))
     return jnp.asarray(width, dtype)
 
 
 def unit_width(widths: Widths, like: Array) -> OneWidth:
     """The width of the facets that two widths stretch."""
-    return jnp.ones_like(like) if widths.gamma is None else Tailed(jnp.ones_like(like), widths.gamma)
+    return jnp.ones_like(like) if widths.gamma is None else StudentWidth(jnp.ones_like(like), widths.gamma)
 
 
 def stretch(w: Vector, widths: Widths) -> Vector:

@@ -13,7 +13,7 @@ from layerjax.channels import Channels, mean
 from layerjax.directions import Vector, add, combine, dot, half_vector, normalize, reflect, refract, scale, select
 from layerjax.normals import facets
 from layerjax.normals.facets import Distribution
-from layerjax.normals.widths import Tailed, Width, Widths
+from layerjax.normals.widths import StudentWidth, Width, Widths
 from layerjax.surfaces.microfacet import mirror_lobe, visibility
 from layerjax.surfaces.thin_film import BARE, Films
 
@@ -107,7 +107,7 @@ def continued_lobe(
         unit = 1.0 / jnp.sqrt(x * x + y * y + z * z)
         cosines = unit * a, unit * b
     transmitted = tuple(fresnel.dielectric_transmittance(cosines[0], ior, cosines[1], film) for film in films)
-    if distribution == "ggx" and not isinstance(alpha, Widths | Tailed):
+    if distribution == "ggx" and not isinstance(alpha, Widths | StudentWidth):
         q = x * x + y * y + (alpha * z) ** 2
         lobe = (ior * alpha * a / q) * (ior * alpha * b / q) / jnp.pi
     else:
@@ -172,7 +172,7 @@ def interface_pdf(
     density = 0.5 * f * facets.twice_projected_area(jnp.abs(wo[2]), wo, alpha, distribution)
     if distribution != "vmf":
         return density
-    assert not isinstance(alpha, Widths | Tailed)
+    assert not isinstance(alpha, Widths | StudentWidth)
     return density / facets.draw_weight(wi, facet_normal(wi, wo, ior), alpha)
 
 

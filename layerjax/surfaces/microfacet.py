@@ -13,14 +13,14 @@ from layerjax._parameters import Parameter, parameter
 from layerjax.channels import Channels, map_channels, per_channel
 from layerjax.directions import Vector, half_vector, mirror, reflect
 from layerjax.normals import facets
-from layerjax.normals.facets import Distribution, check_facets, reflection_pdf, width_of
+from layerjax.normals.facets import Distribution, Facets, check_facets, reflection_pdf
 from layerjax.normals.widths import Width, azimuth_of_tangent
 from layerjax.quadrature import Nodes
 from layerjax.surfaces.contract import Surface
 from layerjax.surfaces.thin_film import ThinFilm
 
 
-class Conductor(Surface):
+class Conductor(Facets, Surface):
     """Rough conductor: f = F D G / (4 cos_i cos_o), with the Fresnel term F of the index n + i k (Walter et al. 2007).
 
     A smooth one is a mirror, whose f is 0 but for a delta: see `layerjax.specular`; in the transports of smooth
@@ -67,16 +67,6 @@ class Conductor(Surface):
     def is_smooth(self) -> bool:
         """Whether it is a mirror, by structure: then all that it reflects is a delta."""
         return self.alpha is None
-
-    @property
-    def width(self) -> Width:
-        """Of its facets: one number, or two along and across a tangent; with gamma, where that is given."""
-        return width_of(self.alpha, self.alpha_y, self.tangent, self.gamma)
-
-    @property
-    def is_anisotropic(self) -> bool:
-        """Whether it has two widths, by structure."""
-        return self.alpha_y is not None
 
     def reflectance(self, cosine: Array) -> Channels:
         """Fresnel reflectance of a facet, by the cosine of incidence on it."""

@@ -17,7 +17,7 @@ from layerjax._numerics import clamp_max, clamp_min, safe_sqrt
 from layerjax.directions import Vector, combine, dot, normalize, reflect, sanitise
 from layerjax.normals import facets
 from layerjax.normals.facet_rule import FacetEvent, Parallels, parallels, polar_angles, visible_normals
-from layerjax.normals.widths import Tailed, Width, Widths, cast_width, narrowest
+from layerjax.normals.widths import StudentWidth, Width, Widths, cast_width, narrowest
 from layerjax.quadrature import gauss_legendre
 from layerjax.transport.adding_doubling.grid import Grid, Region
 
@@ -152,7 +152,7 @@ def dense_refracted_rays(
         # about the direction, not the normal: what a mirror sends back through them asks for more than their own caps
         points = 3 * polar_count(grid) // 2, 3 * azimuth_count(grid, modes) // 2
         return refracted_rays(near, ratio, normals, points, seen)
-    assert not isinstance(normals.alpha, Widths | Tailed)
+    assert not isinstance(normals.alpha, Widths | StudentWidth)
     m, weight, wi = _ggx_normals(grid, near, normals.alpha, modes)
     blur = blur_of_refraction(polar_count(grid), ratio, normals)
     return refract(wi, m, dot(wi, m), weight, ratio, normals, blur, seen)

@@ -20,7 +20,7 @@ import numpy as np
 
 from layerjax._concrete import concrete_values
 from layerjax.compiling import is_traced
-from layerjax.stack import Interface, Medium, Stack, TurbidMedium, is_known
+from layerjax.stack import Interface, Stack, is_known, is_tilted
 from layerjax.surfaces import Conductor
 
 RESOLUTIONS = ((6, 8), (8, 12), (12, 16), (16, 24), (24, 32), (32, 48), (48, 64), (64, 96), (96, 128), (128, 192))
@@ -316,14 +316,6 @@ def resolutions(stack: Stack) -> Iterator[Resolution]:
     tilted = has_tilted(stack)
     for step in ORDINATES if tilted else RESOLUTIONS:
         yield Resolution(*RESOLUTIONS[0], step) if tilted else Resolution(*step, ORDINATES[0])
-
-
-def is_tilted(part: Any) -> bool:
-    """Whether a layer or a base is not symmetric about the normal, as far as is known while tracing: a medium with an
-    axis, or facets of two widths."""
-    if isinstance(part, Interface | Conductor):
-        return part.is_anisotropic
-    return isinstance(part, Medium | TurbidMedium) and not part.phase.is_axisymmetric
 
 
 def has_tilted(stack: Stack) -> bool:

@@ -19,7 +19,7 @@ from layerjax import fresnel
 from layerjax._parameters import cast_arrays
 from layerjax.normals.facets import Distribution
 from layerjax.normals.widths import OneWidth, Widths, cast_width, narrowest
-from layerjax.stack import Interface, Medium, Stack
+from layerjax.stack import Interface, Medium, Stack, is_tilted
 from layerjax.surfaces import Conductor, Lambertian, Surface
 from layerjax.surfaces.thin_film import films_of
 from layerjax.transport.adding_doubling.anisotropic import anisotropic_interface, anisotropic_metal
@@ -34,7 +34,7 @@ from layerjax.transport.adding_doubling.media import Kernel, kernel_modes, kerne
 from layerjax.transport.adding_doubling.moments import terms
 from layerjax.transport.adding_doubling.operators import Layer, add
 from layerjax.transport.adding_doubling.requested_directions import requested_region
-from layerjax.transport.adding_doubling.resolution import Resolution, has_tilted, is_tilted
+from layerjax.transport.adding_doubling.resolution import Resolution, has_tilted
 from layerjax.transport.known_directions import DirectionLookup, KnownDirections
 from layerjax.transport.specular import is_smooth
 

@@ -17,7 +17,7 @@ from layerjax._numerics import safe_div
 from layerjax.channels import Channels, mean, pick
 from layerjax.directions import Vector, bend, mirror, sanitise, scale, select
 from layerjax.normals.facets import Distribution, draw_weight, masking, twice_projected_area
-from layerjax.normals.widths import Tailed, Width, Widths
+from layerjax.normals.widths import StudentWidth, Width, Widths
 from layerjax.stack import Interface
 from layerjax.surfaces import Conductor, Surface
 from layerjax.surfaces.interface import (
@@ -130,7 +130,7 @@ def bounce(
             if refracts is not None:
                 shares = tuple(jnp.where(refracts, 1.0, share) for share in shares)
             weight = masking((wo[0], wo[1], jnp.abs(wo[2])), alpha, distribution)
-            if distribution == "vmf" and not isinstance(alpha, Widths | Tailed):
+            if distribution == "vmf" and not isinstance(alpha, Widths | StudentWidth):
                 weight = weight * draw_weight(wi, m, alpha)
             sent: Channels = ()
             if towards is not None:
@@ -251,7 +251,7 @@ def exit_density(
         value = jnp.where(wo[2] < 0, 2.0 * lobe / twice_projected_area(wi[2], wi, alpha, distribution), 0.0)
         area = twice_projected_area(jnp.abs(wo[2]), wo, alpha, distribution)
         passed = tuple(transmittance * 2.0 / area for transmittance in transmittances)
-        if distribution != "vmf" or isinstance(alpha, Widths | Tailed):
+        if distribution != "vmf" or isinstance(alpha, Widths | StudentWidth):
             return value, passed
         weight = draw_weight(wi, facet_normal(wi, wo, ior), alpha)
         return value / weight, tuple(share * weight for share in passed)
@@ -272,7 +272,7 @@ def _by_normals(scene: Scene, surface: Array | None, function: Callable[[Width, 
         if anisotropic:
             return function(_widths(scene, surface, distribution), distribution)
         alpha = roughness(scene, surface)
-        return function(Tailed(alpha, _gamma(scene, surface)) if distribution == "gtr" else alpha, distribution)
+        return function(StudentWidth(alpha, _gamma(scene, surface)) if distribution == "gtr" else alpha, distribution)
 
     kinds = [kind(interface) for interface in scene.interfaces if not interface.is_smooth]
     result = value_for(*kinds[0])

@@ -10,7 +10,7 @@ import layerjax as lj
 from layerjax.directions import split
 from layerjax.normals import facets
 from layerjax.normals.student import power_integral, power_rest, power_share
-from layerjax.normals.widths import Tailed
+from layerjax.normals.widths import StudentWidth
 from layerjax.surfaces.interface import interface_pdf, interface_reflection, interface_sample, interface_transmission
 from tests.helpers.derivatives import with_slopes
 from tests.helpers.interfaces import pairs
@@ -22,7 +22,7 @@ GAMMAS = [1.75, 2.0, 3.3, 40.0]
 
 
 def tailed(alpha, gamma):
-    return Tailed(jnp.asarray(alpha), jnp.asarray(gamma))
+    return StudentWidth(jnp.asarray(alpha), jnp.asarray(gamma))
 
 
 def masking(cosine, alpha, gamma):
@@ -175,7 +175,7 @@ def test_values_draws_and_slopes_are_finite(dtype):
     u = tuple(random.choice([0.0, 1.0 - 1e-7, *random.random(200)], (3, 2000)).astype(dtype))
 
     def everything(wi, wo, ior, alpha, gamma, u):
-        below, width = (wo[0], wo[1], -wo[2]), Tailed(alpha, gamma)
+        below, width = (wo[0], wo[1], -wo[2]), StudentWidth(alpha, gamma)
         reflected = interface_reflection(wi, wo, ior, width, KIND)
         passed = interface_transmission(wi, below, ior, width, KIND)
         drawn, _ = interface_sample(wi, ior, width, *u, KIND)
@@ -196,7 +196,7 @@ def test_slopes_of_values_and_draws_are_differences(gamma):
         alpha, gamma, theta = numbers
         f = lj.evaluate(lj.Stack([], lj.Conductor(0.2, 3.0, alpha, KIND, gamma=gamma)), wi, wo)[0]
         m = facets.sample(
-            split(lj.direction(theta, 0.3)), Tailed(alpha, gamma), jnp.asarray(0.3), jnp.asarray(0.8), KIND
+            split(lj.direction(theta, 0.3)), StudentWidth(alpha, gamma), jnp.asarray(0.3), jnp.asarray(0.8), KIND
         )
         return jnp.stack([f, *m])
 
