@@ -19,6 +19,11 @@ from tests.helpers.sampling import DRAWS, SIGNIFICANCE, chi_square
 KIND = "gtr"
 MIRROR = (0.01, 20.0)  # of index 1 reflects 0.9999 of the light
 GAMMAS = [1.75, 2.0, 3.3, 40.0]
+density = jax.jit(facets.density, static_argnums=2)
+twice_projected_area = jax.jit(facets.twice_projected_area, static_argnums=3)
+sample = jax.jit(facets.sample, static_argnums=4)
+reflection_pdf = jax.jit(facets.reflection_pdf, static_argnums=3)
+masking_of = jax.jit(facets.masking, static_argnums=2)
 
 
 def tailed(alpha, gamma):
@@ -62,7 +67,7 @@ def drawn_energies(theta, alpha, gamma, index, draws=400_000):
 @pytest.mark.parametrize("k", [0.5, 1.0, 2.3, 20.0, 77.0, 78.0])
 def test_powers_of_the_cosine_are_integrated(k):
     t = np.concatenate([[0.0], np.geomspace(1e-8, 0.5 * np.pi - 1e-9, 300)])
-    share, rest = (f(jnp.sin(t), jnp.cos(t), jnp.asarray(k)) for f in (power_share, power_rest))
+    share, rest = (jax.jit(f)(np.sin(t), np.cos(t), k) for f in (power_share, power_rest))
     np.testing.assert_allclose(share, betainc(0.5, 0.5 * (k + 1.0), np.sin(t) ** 2), rtol=1e-9, atol=1e-12)
     exact = betainc(0.5 * (k + 1.0), 0.5, np.cos(t) ** 2)
     np.testing.assert_allclose(rest, exact, atol=2e-8)  # its argument rounds to 1
@@ -79,13 +84,13 @@ def test_it_is_normalised_and_masking_is_exact(alpha, gamma):
     measure = 0.25 * np.pi * w * 3.0 * alpha * np.tan(y) ** 2 / np.cos(y) ** 2
     cosine = 1.0 / np.sqrt(1.0 + slope**2)
     m = jnp.asarray(slope * cosine), jnp.zeros(slope.shape), jnp.asarray(cosine)
-    found = facets.density(m, tailed(alpha, gamma), KIND)
+    found = density(m, tailed(alpha, gamma), KIND)
     whole = np.where(cosine > 1e-6, found * cosine**4 * 2.0 * np.pi * slope, 0.0) * measure
     beyond = (1.0 + 1e12 / alpha**2 / (gamma - 1.0)) ** (1.0 - gamma)  # of normals with a cosine below 1e-6
     np.testing.assert_allclose(np.sum(whole) + beyond, 1.0, atol=1e-7)
     for theta in (1e-3, 0.2, 0.9, 1.4, 1.55, 1.5707):
         w = split(lj.direction(theta, 0.3))
-        found = facets.masking(w, tailed(alpha, gamma), KIND)
+        found = masking_of(w, tailed(alpha, gamma), KIND)
         np.testing.assert_allclose(found, masking(np.cos(theta), alpha, gamma), rtol=1e-9)
 
 
@@ -94,18 +99,18 @@ def test_it_is_ggx_at_2_and_nears_beckmann():
     u1, u2 = (jnp.asarray(u) for u in np.random.default_rng(0).random((2, 200)))
     for alpha in (jnp.asarray(a) for a in (1.0, 0.3, 0.003)):
         same, most = tailed(alpha, 2.0), tailed(alpha, 40.0)
-        np.testing.assert_allclose(facets.density(w, same, KIND), facets.density(w, alpha, "ggx"), rtol=1e-9)
+        np.testing.assert_allclose(density(w, same, KIND), density(w, alpha, "ggx"), rtol=1e-9)
         for part, exact in ((same, "ggx"), (most, "beckmann")):
-            areas = (facets.twice_projected_area(w[2], w, a, k) for a, k in ((part, KIND), (alpha, exact)))
+            areas = (twice_projected_area(w[2], w, a, k) for a, k in ((part, KIND), (alpha, exact)))
             np.testing.assert_allclose(*areas, rtol=1e-9 if exact == "ggx" else 1.2e-2)  # to first order 3 / (8 gamma)
         # draws of other numbers, but with the same density: what u1 and u2 are for one is known for the other
         v = split(lj.direction(0.8, 0.1))
-        m = facets.sample(v, same, u1, u2, KIND)
-        pdf = facets.reflection_pdf(m, v, same, KIND)
-        np.testing.assert_allclose(pdf, facets.reflection_pdf(m, v, alpha, "ggx"), rtol=1e-9)
+        m = sample(v, same, u1, u2, KIND)
+        pdf = reflection_pdf(m, v, same, KIND)
+        np.testing.assert_allclose(pdf, reflection_pdf(m, v, alpha, "ggx"), rtol=1e-9)
     # the density along the normal is the same; at one alpha it is exp(-1) in the limit, less 1 / (2 gamma) of that
-    at = facets.density(split(lj.direction(np.arctan(0.3), 0.0)), tailed(0.3, 40.0), KIND)
-    limit = facets.density(split(lj.direction(np.arctan(0.3), 0.0)), jnp.asarray(0.3), "beckmann")
+    at = density(split(lj.direction(np.arctan(0.3), 0.0)), tailed(0.3, 40.0), KIND)
+    limit = density(split(lj.direction(np.arctan(0.3), 0.0)), jnp.asarray(0.3), "beckmann")
     np.testing.assert_allclose(at / limit, 1.0 - 0.5 / 40.0, atol=1e-3)
 
 
@@ -116,7 +121,7 @@ def test_normals_are_drawn_as_they_are_seen(gamma):
     u1, u2 = np.random.default_rng(1).random((2, 500))
     for theta in (1e-3, 0.7, 1.3, 1.569):
         wi = split(lj.direction(theta, 0.9))
-        m = facets.sample(wi, tailed(alpha, gamma), jnp.asarray(u1), jnp.asarray(u2), KIND)
+        m = sample(wi, tailed(alpha, gamma), jnp.asarray(u1), jnp.asarray(u2), KIND)
         size = alpha * np.sqrt(gamma - 1.0)
         p = -(np.cos(0.9) * m[0] + np.sin(0.9) * m[1]) / m[2] / size
         q = -(np.cos(0.9) * m[1] - np.sin(0.9) * m[0]) / m[2] / size
@@ -127,7 +132,7 @@ def test_normals_are_drawn_as_they_are_seen(gamma):
         z, planar = np.cos(theta), size * np.sin(theta)
         below = z * (1.0 + np.sign(p) * betainc(0.5, 0.5 * (k + 1.0), p * p / (1.0 + p * p)))
         below += planar * (1.0 + p * p) ** (-0.5 * k) / (k * whole)
-        area = facets.twice_projected_area(wi[2], wi, tailed(alpha, gamma), KIND)
+        area = twice_projected_area(wi[2], wi, tailed(alpha, gamma), KIND)
         assert np.quantile(np.abs(below / area - u1), 0.99) < 1e-8
         assert np.max(np.abs(below / area - u1)) < 3e-5
 
@@ -200,11 +205,12 @@ def test_slopes_of_values_and_draws_are_differences(gamma):
         )
         return jnp.stack([f, *m])
 
+    slope_of, values_of = jax.jit(jax.jacfwd(values)), jax.jit(jax.vmap(values))
     for alpha, theta in ((0.1, 1.5), (0.8, 0.4)):
         at = jnp.array([alpha, gamma, theta])
         step = 1e-6 * np.diag(at)
-        found = jax.jit(jax.jacfwd(values))(at)
-        expected = (jax.vmap(values)(at + step) - jax.vmap(values)(at - step)) / (2.0 * np.diag(step)[:, None])
+        found = slope_of(at)
+        expected = (values_of(at + step) - values_of(at - step)) / (2.0 * np.diag(step)[:, None])
         np.testing.assert_allclose(found, expected.T, rtol=2e-5, atol=1e-6)
 
 
@@ -236,10 +242,10 @@ def test_two_equal_widths_are_one():
     one, two = tailed(0.3, 3.0), facets.width_of(jnp.asarray(0.3), jnp.asarray(0.3), jnp.asarray(0.7), jnp.asarray(3.0))
     u = jnp.asarray(0.3), jnp.asarray(0.8)
     for f in (
-        lambda width: facets.density(wi, width, KIND),
-        lambda width: facets.twice_projected_area(wi[2], wi, width, KIND),
-        lambda width: jnp.stack(facets.sample(wi, width, *u, KIND)),
-        lambda width: facets.reflection_pdf(wo, wi, width, KIND),
+        lambda width: density(wi, width, KIND),
+        lambda width: twice_projected_area(wi[2], wi, width, KIND),
+        lambda width: jnp.stack(sample(wi, width, *u, KIND)),
+        lambda width: reflection_pdf(wo, wi, width, KIND),
     ):
         np.testing.assert_allclose(f(two), f(one), rtol=1e-9)
 

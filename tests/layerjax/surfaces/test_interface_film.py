@@ -38,6 +38,7 @@ def airy(cosine, ior, film_ior, phase):
     return np.mean(shares, axis=0)
 
 
+@jax.jit
 def reflectance(cosine, ior, film_ior, phase):
     return fresnel.dielectric(cosine, ior, film=fresnel.Film(film_ior, phase))
 
@@ -58,7 +59,7 @@ def test_reflectance_and_transmittance_are_sums_of_airy():
     assert np.mean(FILM_IOR**2 < 1.0 - COSINE**2) > 0.1  # evanescent in the film
     np.testing.assert_array_equal(found[~exists], 1.0)
     film = fresnel.Film(*numbers[2:])
-    through = fresnel.dielectric_transmittance(numbers[0], numbers[1], refracted, film)[exists]
+    through = jax.jit(fresnel.dielectric_transmittance)(numbers[0], numbers[1], refracted, film)[exists]
     np.testing.assert_allclose(through, passed[exists], rtol=1e-10, atol=1e-290)  # also where little tunnels
     np.testing.assert_allclose(found[exists] + through, 1.0, atol=1e-13)
     single = reflectance(*(jnp.asarray(x, jnp.float32) for x in numbers))
