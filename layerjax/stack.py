@@ -4,6 +4,7 @@ All are pytrees whose numeric leaves are arrays (concrete or traced); what is no
 refuse concrete values outside the documented box (`layerjax.RANGES`) by name.
 """
 
+import operator
 from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 from typing import Any, cast
@@ -259,14 +260,18 @@ def simplify_and_name(stack: Stack) -> tuple[Stack, tuple[str, ...]]:
         if isinstance(layer, Medium):
             if _is_everywhere(layer.thickness, 0.0):
                 continue
-            layer = eqx.tree_at(lambda medium: medium.phase, _make_static(layer), layer.phase.simplify())
+            phase, layer = layer.phase.simplify(), _make_static(layer)
+            if phase is not layer.phase:
+                layer = eqx.tree_at(lambda medium: medium.phase, layer, phase)
             if is_known(layer.f0, 1.0):
                 layer = eqx.tree_at(lambda medium: medium.f0, layer, None)
         layers.append(layer)
         names.append(f"layers[{index}]")
     if isinstance(stack.base, Conductor):
         stack = eqx.tree_at(lambda s: s.base, stack, _merge_widths(_drop_film(stack.base)))
-    return eqx.tree_at(lambda s: s.layers, stack, tuple(layers)), tuple(names)
+    if len(layers) < len(stack.layers) or any(map(operator.is_not, layers, stack.layers)):
+        stack = eqx.tree_at(lambda s: s.layers, stack, tuple(layers))
+    return stack, tuple(names)
 
 
 def _drop_film(part: Any) -> Any:
@@ -318,6 +323,8 @@ def is_known(value: Any, number: float) -> bool:
 
 def _make_static(medium: Medium) -> Medium:
     known = [_static_constant(medium.albedo), None if medium.f0 is None else _static_constant(medium.f0)]
+    if known[0] is medium.albedo and known[1] is medium.f0:
+        return medium
     return eqx.tree_at(lambda m: (m.albedo, m.f0), medium, known, is_leaf=lambda leaf: leaf is None)
 
 
