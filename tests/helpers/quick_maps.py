@@ -88,13 +88,3 @@ def full_disk(monkeypatch: pytest.MonkeyPatch, after: int | None) -> Iterator[No
     with monkeypatch.context() as patch:
         patch.setattr(Path, "replace", full)
         yield
-
-
-def stop_at(stage, done=0):
-    """Progress that interrupts its run when so much of a stage is done."""
-
-    def stop(*told):
-        if told[0] == stage and told[1] >= done:
-            raise KeyboardInterrupt
-
-    return stop

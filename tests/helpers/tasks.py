@@ -124,3 +124,13 @@ def wait_until(condition: Callable[[], bool], seconds: float = 120.0) -> None:
     while not condition():
         assert time.monotonic() < end, "it never came to that"
         time.sleep(0.002)
+
+
+def stop_at(stage: str, done: int = 0) -> Callable[..., None]:
+    """Progress that interrupts its run when so much of a stage, whose name begins so, is done."""
+
+    def stop(*told: Any) -> None:
+        if told[0].startswith(stage) and told[1] >= done:
+            raise KeyboardInterrupt
+
+    return stop

@@ -61,7 +61,6 @@ def test_values_are_those_of_the_transport_within_a_tenth_of_the_noise_or_it_is_
 
 
 def test_derivatives_are_those_of_the_emulator(emulated, vectors):
-    """Inside, and on the bounds, where they do not end."""
     predict = jax.jit(lambda vector: emulated.model.predict(vector))
     slopes_at = jax.jit(jax.jacfwd(predict))
     for vector, step in ((vectors[7], 1e-5), (emulated.low, 1e-5), (emulated.high, -1e-5)):
@@ -76,7 +75,6 @@ def test_derivatives_are_those_of_the_emulator(emulated, vectors):
 
 
 def fitted(out, transport, **options):
-    """A map of six texels."""
     problem = problem_of(transport)
     exact = np.asarray(problem.predict(np.array([*TRUTH, 1.0])))
     values = exact * (1.0 + NOISE.relative * np.random.default_rng(2).standard_normal((6, *exact.shape)))

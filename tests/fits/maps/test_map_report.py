@@ -1,5 +1,4 @@
-"""The report of a map: its numbers, tables and sentences are those of the arrays that were written; its page is one
-file, of stores in every state; its pictures show numbers where they are, and grey where there are none."""
+"""The report of a map: numbers, tables, sentences and pictures are those of the arrays; its page is one whole file."""
 
 import os
 import re
@@ -21,6 +20,9 @@ SHAPE, CHUNK = (20, 30), (10, 10)
 PLACES = np.arange(600).reshape(SHAPE)
 RATIO = numbers(SHAPE)["reduced_chi_square"]
 FULL = 8  # pictures of a map of three parameters: two of each, flags, chi-square
+PRIOR = {"kind": "gaussian", "scale": dict.fromkeys(NAMES, 0.05)}
+SMOOTHING = {"prior": PRIOR, "rounds": 3, "settled": False, "largest_moves": [3.0, 0.5]}
+ROUNDS = "base.albedo 0.05), in 3 rounds; "
 
 
 @pytest.fixture(scope="module")
@@ -75,7 +77,6 @@ def test_counts_quartiles_and_the_verdict_are_those_of_the_arrays(map, painted):
 
 
 def changed(**arrays):
-    """A good map but for these arrays."""
     made = numbers(SHAPE)
     for name, array in arrays.items():
         made[name][...] = array
@@ -125,11 +126,6 @@ def test_the_verdict_is_a_matter_of_its_thresholds(arrays, more, sound, sentence
     if more.get("common") is OFF:
         rows = (("layers[0].ior", "1.50", "0.10", "1"), ("layers[0].thickness_mm", "2", "unknown", "mm"))
         assert report.common_table(map).rows == rows
-
-
-PRIOR = {"kind": "gaussian", "scale": dict.fromkeys(NAMES, 0.05)}
-SMOOTHING = {"prior": PRIOR, "rounds": 3, "settled": False, "largest_moves": [3.0, 0.5]}
-ROUNDS = "base.albedo 0.05), in 3 rounds; "
 
 
 @pytest.mark.parametrize(
@@ -189,23 +185,19 @@ def test_the_command_writes_the_page_beside_the_store_or_says_why_not(tmp_path, 
         assert message in refused(["report", *words.split()], capsys, tmp_path)
 
 
-def test_an_image_is_the_map_with_row_0_on_top_in_colours_over_the_middle():
+def test_an_image_is_the_map_with_row_0_on_top_in_colours_over_the_middle_or_of_the_gravest_flag():
     values = np.arange(12.0).reshape(3, 4)
     values[0, 1], values[2, 2] = np.nan, np.inf
     figure = report.value_picture(values, "a", "mm", "viridis", report.inner_norm(values))
     shown = np.ma.filled(np.ma.asarray(figure.axes[0].images[-1].get_array(), float), np.nan)
     np.testing.assert_array_equal(shown, np.where(np.isfinite(values), values, np.nan))
-    assert figure.axes[0].get_ylim() == (2.5, -0.5)
-    assert figure.axes[1].get_ylabel() == "mm"
+    assert (figure.axes[0].get_ylim(), figure.axes[1].get_ylabel()) == ((2.5, -0.5), "mm")
     norm = report.inner_norm(np.concatenate([np.linspace(1.0, 2.0, 999), [1e9, np.nan, np.inf]]))
     assert (norm.vmin, norm.vmax) == (pytest.approx(1.0, abs=0.02), pytest.approx(2.0, abs=0.02))
     assert isinstance(report.inner_norm(np.geomspace(1e-3, 1.0, 100)), LogNorm)
     for each in ([], [np.nan], [0.0, 0.0], [-2.0, -2.0]):
         norm = report.inner_norm(np.array(each))
         assert norm.vmin < norm.vmax
-
-
-def test_a_texel_is_shown_as_the_gravest_of_its_flags():
     names = ["", "masked", "too_few_measurements", "failed restarted", "fitted poor", "fitted converged poor at_bound"]
     names += ["fitted converged " + one for one in ("unidentified at_bound", "at_bound restarted", "restarted", "")]
     figure = report.flag_picture(np.array([sum(FLAGS[one] for one in each.split()) for each in names], np.uint16))

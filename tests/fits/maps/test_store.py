@@ -1,8 +1,6 @@
-"""The store of a map: what was written is read again, also by zarr and xarray alone; nothing counts that is half there;
-and what is where a store is to be is resumed, refused by name, or thrown away if that is wanted."""
+"""The store of a map: read as it was written, whole or not at all; resumed, refused by name, or replaced if wanted."""
 
 import errno
-import json
 import os
 import shutil
 from pathlib import Path
@@ -18,7 +16,9 @@ from fits._files import PARTIAL
 from fits.maps.store import FLAGS, SMOOTHED, Store, arrays_of, blocks_of, open_map
 from tests.helpers.files import contents
 from tests.helpers.painted_maps import ATTRIBUTES, NAMES, UNITS, numbers, stored
-from tests.helpers.quick_maps import assert_same, coat, fitted, full_disk, stop_at
+from tests.helpers.quick_maps import assert_same, coat, fitted, full_disk
+from tests.helpers.refusals import refuses
+from tests.helpers.tasks import stop_at
 
 SHAPE, CHUNK = (7, 10), (4, 4)
 BLOCKS = list(blocks_of(SHAPE, CHUNK))
@@ -27,7 +27,6 @@ FILE = Path("values") / NAMES[0] / "c" / "1" / "0"
 
 @pytest.fixture
 def map(tmp_path):
-    """A whole map of six chunks."""
     return stored(tmp_path / "a.zarr", numbers(SHAPE), CHUNK)
 
 
@@ -35,41 +34,33 @@ def write(store, block):
     store.write(block, {name: values[block] for name, values in numbers(SHAPE).items()})
 
 
-def test_what_is_written_is_read(map):
-    arrays = numbers(SHAPE)
+def test_what_is_written_is_read_also_by_zarr_and_xarray_without_us(map, tmp_path):
+    arrays, group = numbers(SHAPE), zarr.open_group(map.path, mode="r")
     read = {f"{part}/{name}": getattr(map, part)[name] for part in ("values", "errors") for name in NAMES}
     read |= {name: getattr(map, name) for name in ("reduced_chi_square", "flags", "at_bound", "measurements")}
-    for name, array in arrays.items():
-        np.testing.assert_array_equal(read[name], array, err_msg=name)
+    assert arrays.keys() == arrays_of(NAMES).keys()
+    for name, (dtype, _) in arrays_of(NAMES).items():
+        np.testing.assert_array_equal(read[name], arrays[name], err_msg=name)
+        assert (group[name].dtype, group[name].shape, group[name].chunks) == (dtype, SHAPE, CHUNK)
+        np.testing.assert_array_equal(group[name][...], arrays[name])
     assert (map.names, map.units, map.shape, map.done, len(map.values)) == (NAMES, UNITS, SHAPE, 1.0, 3)
     assert map.attributes["noise"] == ATTRIBUTES["noise"]
     assert Store(map.path).unfinished() == []
     assert map.has("converged").all()
     assert (map.option("starts"), map.option("converged_share"), map.numerical_error) == (8, 0.99, None)
     assert map.smoothed is map.smoothed_errors is map.smoothing is None
-    for call, error, words in (
-        (lambda: map.has("good"), ValueError, r"meaning: 'good' given, must be one of fitted, "),
-        (lambda: map.values["albedo"], KeyError, r"base\.albedo"),
-        (lambda: map["smoothed/values/base.albedo"], KeyError, "is not one of"),
-    ):
-        with pytest.raises(error, match=words):
-            call()
+    refuses(r"meaning: 'good' given, must be one of fitted, ", map.has, "good")
+    for mapping, name in ((map.values, "albedo"), (map, "smoothed/values/base.albedo")):
+        with pytest.raises(KeyError, match=r"is not one of .*base\.albedo"):
+            mapping[name]
 
-
-def test_zarr_and_xarray_read_it_without_us(map, tmp_path):
-    arrays = numbers(SHAPE)
-    stored(tmp_path / "b.zarr", arrays, CHUNK)
-    group = zarr.open_group(map.path, mode="r")
-    for name, (dtype, _) in arrays_of(NAMES).items():
-        assert (group[name].dtype, group[name].shape, group[name].chunks) == (dtype, SHAPE, CHUNK)
-        np.testing.assert_array_equal(group[name][...], arrays[name])
     flags = dict(group["flags"].attrs)
     assert dict(zip(flags["flag_meanings"].split(), flags["flag_masks"], strict=True)) == FLAGS
     assert dict(group["values/base.albedo"].attrs) == {"units": "1"}
     values = xarray.open_zarr(map.path, group="values", consolidated=False)
     assert values["base.albedo"].dims == ("row", "column")
     np.testing.assert_array_equal(values["base.albedo"], arrays["values/base.albedo"])
-    assert_same(map, open_map(tmp_path / "b.zarr"))  # the same numbers are the same bytes
+    assert_same(map, stored(tmp_path / "b.zarr", arrays, CHUNK))  # the same numbers are the same bytes
 
 
 def test_a_full_disk_in_the_midst_of_a_chunk_is_named_and_the_chunk_is_not_there(tmp_path, monkeypatch):
@@ -105,10 +96,9 @@ def test_a_damaged_chunk_is_named_and_unfinished(damage, map):
 
 
 def change_root(path, **changes):
-    described = json.loads((path / "zarr.json").read_text())
-    about = described["attributes"]["layerjax"]
-    described["attributes"]["layerjax"] = {name: one for name, one in (about | changes).items() if one is not None}
-    (path / "zarr.json").write_text(json.dumps(described))
+    attributes = zarr.open_group(path).attrs
+    about = attributes["layerjax"] | changes
+    attributes["layerjax"] = {name: one for name, one in about.items() if one is not None}
 
 
 def spoil_smoothed(path, *names):
@@ -151,8 +141,7 @@ def test_what_is_no_such_store_is_refused(damage, words, map):
     ],
 )
 def test_what_differs_is_named(whole, measured, changed, named):
-    with pytest.raises(ValueError, match=rf"holds the work of another problem \({named}\); --force"):
-        fitted(whole.path, measured, **changed)
+    refuses(rf"holds the work of another problem \({named}\); --force", fitted, whole.path, measured, **changed)
 
 
 def test_what_is_not_ours_is_never_touched(tmp_path, measured):
@@ -163,19 +152,16 @@ def test_what_is_not_ours_is_never_touched(tmp_path, measured):
     before = contents(tmp_path)
     for path in sorted(tmp_path.iterdir()):
         for force in (False, True):
-            with pytest.raises(ValueError, match="is no store of a fitted map") as error:
-                fitted(path, measured, force=force)
-            assert str(error.value).startswith(str(path))
+            words = refuses("is no store of a fitted map", fitted, path, measured, force=force)
+            assert words.startswith(str(path))
     assert contents(tmp_path) == before
-    with pytest.raises(ValueError, match=r"coat\.zarr: there is no directory"):
-        fitted(tmp_path / "no" / "coat.zarr", measured)
+    refuses(r"coat\.zarr: there is no directory", fitted, tmp_path / "no" / "coat.zarr", measured)
 
 
 @pytest.mark.parametrize("damaged", ["pilot/zarr.json", "pilot/starts/c/0/0", "pilot", "flags"])
 def test_a_damaged_store_is_named_and_can_be_replaced(out, measured, whole, damaged):
     shutil.rmtree(out / damaged) if (out / damaged).is_dir() else os.truncate(out / damaged, 10)
-    with pytest.raises(ValueError, match=rf"{out}.*: damaged"):
-        fitted(out, measured)
+    refuses(rf"{out}.*: damaged", fitted, out, measured)
     assert_same(fitted(out, measured, force=True), whole)
 
 
@@ -185,8 +171,7 @@ def test_force_keeps_what_is_of_the_same_fit_and_a_map_until_there_can_be_anothe
     fitted(out, measured, force=True, **thresholds, progress=lambda *call: calls.append(call))
     assert calls == [("map", 4, 4)]
 
-    with pytest.raises(ValueError, match="mask: no texel takes part"):
-        fitted(out, measured, mask=np.zeros((8, 8), bool), force=True)
+    refuses("mask: no texel takes part", fitted, out, measured, mask=np.zeros((8, 8), bool), force=True)
     with pytest.raises(KeyboardInterrupt):
         fitted(out, measured, seed=1, force=True, progress=stop_at("pilot"))
     assert_same(fits.open_map(out), whole)
@@ -199,8 +184,7 @@ def test_one_writer_and_what_killed_runs_left_beside_it_is_removed(tmp_path, out
     refused = []
 
     def second(stage, done, total=None, info=""):
-        with pytest.raises(ValueError, match="in use by another process"):
-            fitted(out, measured)
+        refuses("in use by another process", fitted, out, measured)
         refused.append(stage)
 
     fitted(out, measured, progress=second)
