@@ -1,51 +1,31 @@
 """One small fit of simulated data that the tests of results, reports and the command line share."""
 
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
-
 import numpy as np
 import pytest
 
-import layerjax as lj
-from fits import Fit, Measurements, fit, read_problem, simulate, slices, write_csv
+from fits import fit, read_problem, write_csv
 from fits.cli.parser import main
+from tests.helpers import coats
 from tests.helpers.models import line_fit
-
-PROBLEM = """\
-# a hazy coat over paint
-transport = "SingleScattering"
-
-[[layers]]
-kind = "Medium"
-thickness = { start = 1.0, low = 0.05, high = 5.0 }
-albedo = 0.8
-
-[base]
-kind = "Lambertian"
-albedo = { start = 0.5, low = 0.0, high = 1.0 }
-"""
 
 
 @pytest.fixture(scope="session")
-def coat_toml(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def coat_toml(tmp_path_factory):
     """A stack file with two free parameters."""
     path = tmp_path_factory.mktemp("stack") / "coat.toml"
-    path.write_text(PROBLEM)
+    path.write_text(coats.HAZY)
     return path
 
 
 @pytest.fixture(scope="session")
-def coat_data() -> Measurements:
+def coat_data():
     """Noisy slices of that stack with known parameters; the last ten measurements are masked."""
-    truth = lj.Stack([lj.Medium(thickness=0.6, albedo=0.8)], base=lj.Lambertian(albedo=0.4))
-    view = slices(incidence=(10, 50), azimuth=(0, 60))
-    data = simulate(truth, view, transport=lj.SingleScattering(), noise=0.03, seed=1)
+    data = coats.readings("coated")
     return data.where(np.arange(len(data)) < len(data) - 10, "the last ten readings are left out")
 
 
 @pytest.fixture
-def work(tmp_path: Path, coat_data: Measurements, coat_toml: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def work(tmp_path, coat_data, coat_toml, monkeypatch):
     """A current directory that holds data.csv and coat.toml."""
     write_csv(coat_data, tmp_path / "data.csv")
     (tmp_path / "coat.toml").write_text(coat_toml.read_text())
@@ -54,10 +34,10 @@ def work(tmp_path: Path, coat_data: Measurements, coat_toml: Path, monkeypatch: 
 
 
 @pytest.fixture
-def layerjax(capsys: pytest.CaptureFixture[str]) -> Callable[..., Any]:
+def layerjax(capsys):
     """What a command prints, to `out` and `err`, that ends with this code."""
 
-    def run(words: str, code: int = 0) -> Any:
+    def run(words, code=0):
         capsys.readouterr()
         assert main(words.split()) == code
         return capsys.readouterr()
@@ -66,13 +46,12 @@ def layerjax(capsys: pytest.CaptureFixture[str]) -> Callable[..., Any]:
 
 
 @pytest.fixture(scope="session")
-def coat_fit(coat_toml: Path, coat_data: Measurements) -> Fit:
-    """The fit of that stack to those slices."""
+def coat_fit(coat_toml, coat_data):
     given = read_problem(coat_toml)
     return fit(given.stack, coat_data, transport=given.transport, noise=given.noise, starts=4, seed=0)
 
 
 @pytest.fixture(scope="session")
-def result() -> Fit:
+def result():
     """The fit of a line: the cheapest model there is."""
     return line_fit()

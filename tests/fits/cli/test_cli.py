@@ -1,8 +1,13 @@
-"""The `layerjax` command at work: every command writes and prints what it should."""
+"""The `layerjax` command at work: every command writes and prints what it should; flags that are named are its own."""
 
+import ast
+import contextlib
 import io
 import json
 import os
+import re
+import shlex
+import shutil
 import subprocess
 import sys
 import warnings
@@ -12,29 +17,56 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fits import Problem, load_fit, load_posterior, progress, read, save_fit, slices
+import fits
+import layerjax as lj
+from fits import load_fit, load_posterior, progress, read, save_fit, slices
 from fits.cli import commands
-from fits.cli.arguments import COMMANDS
+from fits.cli.arguments import COMMANDS, build_parser
 from fits.cli.parser import main
 from fits.engines import run
+from fits.maps.store import FLAGS
 from fits.progress import show_progress
 from fits.reports.html import FitReport
 from tests.helpers import tasks
-from tests.helpers.coats import make_folder
+from tests.helpers.coats import TRUE, make_folder
 from tests.helpers.commands import refused
+from tests.helpers.painted_maps import numbers, stored, without
 from tests.helpers.places import ROOT
 
-TRUE = {"layers[0].thickness": 0.6, "base.albedo": 0.4}  # of the stack behind coat_data
+EVERY = [name for one in COMMANDS.values() for name in (*one.particular, *one.shared.split())]
+OTHERS = {"--help", "--version", "--traceback", "--nthreads"}  # those of the parser itself, and of `dask worker`
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")), *sorted((ROOT / "docs" / "guides").glob("*.md"))]
+SHOWN = [
+    (page, line)
+    for page in PAGES
+    for block in re.findall(r"```(?:\{code-block\} )?sh\n(.*?)```", page.read_text().replace("\\\n", " "), re.DOTALL)
+    for line in re.split(r"\n|&&", block)
+    if line.split()[:1] == ["layerjax"]
+]
+WORDS = ["fit-map", "map.npy", "--geometry", "view.csv", "--stack", "coat.toml", "--out", "coat.zarr"]
+HELP = """
+import contextlib, os, sys
+from fits.cli import main
+from fits.cli.arguments import COMMANDS, build_parser
+from fits.cli.input_output import use_jax
+for words in ([], *([name] for name in COMMANDS)):
+    with contextlib.suppress(SystemExit):
+        main([*words, "--help"])
+import fits.data.formats
+assert "jax" not in sys.modules
+use_jax()
+assert os.environ["TF_CPP_MIN_LOG_LEVEL"] == "3"  # XLA reads what it may print as it is loaded: it is told before
+"""
 
 
 def test_fit_writes_a_result(work, capsys, coat_toml, layerjax):
     words = "fit data.csv --stack coat.toml --out result --starts 4"
     output = layerjax(f"{words} --max-polar-angle 80")
-    for word in (*TRUE, "chi2/dof", "4 starts", "result/report.html", "fit 4/4"):
+    for word in (*TRUE["coated.csv"], "chi2/dof", "4 starts", "result/report.html", "fit 4/4"):
         assert word in output.out + output.err
     result = load_fit("result")
     assert result.problem.data.used().theta_o.max() <= 80
-    for name, truth in TRUE.items():
+    for name, truth in TRUE["coated.csv"].items():
         assert abs(result.values[name] - truth) < 4 * result.standard_errors[name]
     assert (work / "result" / "problem.toml").read_text() == coat_toml.read_text()
     stored = json.loads((work / "result" / "fit.json").read_text())
@@ -45,7 +77,7 @@ def test_fit_writes_a_result(work, capsys, coat_toml, layerjax):
 
 
 def test_results_are_compared(work, capsys, coat_fit, layerjax):
-    root = Problem(coat_fit.problem.stack, coat_fit.problem.data, objective="cube_root")
+    root = fits.Problem(coat_fit.problem.stack, coat_fit.problem.data, objective="cube_root")
     save_fit(coat_fit, "best")
     save_fit(replace(coat_fit, vector=coat_fit.vector + 2 * coat_fit.errors), "worse")
     save_fit(replace(coat_fit, problem=root), "root")
@@ -118,17 +150,16 @@ def test_predictions_are_written(work, capsys, coat_fit, layerjax):
     assert "--force" in refused(words.split(), capsys, work)
 
 
-def test_info_says_what_is_there_and_draws_it(work, monkeypatch, layerjax):
+def test_info_says_what_is_there_and_draws_it(work, layerjax):
     output = layerjax("info data.csv --out data.png").out
     for word in ("csv", "brdf", "10°", "50°", "sigma", "median 3.00%"):
         assert word in output
     assert (work / "data.png").read_bytes().startswith(b"\x89PNG")
     (work / "data.png").write_bytes(b"precious")
-    ascii_only = io.BytesIO()
-    with monkeypatch.context() as patch:  # a terminal without a sign gets a question mark
-        patch.setattr(sys, "stdout", io.TextIOWrapper(ascii_only, encoding="ascii"))
+    ascii_only = io.TextIOWrapper(io.BytesIO(), encoding="ascii")
+    with contextlib.redirect_stdout(ascii_only):  # a terminal without a sign gets a question mark
         assert main(["info", "data.csv"]) == 0
-        output = ascii_only.getvalue().decode("ascii")
+    output = ascii_only.buffer.getvalue().decode("ascii")
     assert "50?" in output
     assert "--force" in output
     assert (work / "data.png").read_bytes() == b"precious"
@@ -149,28 +180,12 @@ def test_convert_and_simulate_write_csv(work, coat_data, layerjax):
     assert 0.02 < float(np.median(first.values)) < 0.16
 
 
-HELP = """
-import contextlib, os, sys
-from fits.cli import main
-from fits.cli.arguments import COMMANDS
-from fits.cli.input_output import use_jax
-for words in ([], *([name] for name in COMMANDS)):
-    with contextlib.suppress(SystemExit):
-        main([*words, "--help"])
-import fits.data.formats
-assert "jax" not in sys.modules
-use_jax()
-assert os.environ["TF_CPP_MIN_LOG_LEVEL"] == "3"  # XLA reads what it may print as it is loaded: it is told before
-"""
-
-
 def test_help_and_reading_need_no_jax_whose_alarms_are_not_shown() -> None:
     environment = {name: word for name, word in os.environ.items() if name != "TF_CPP_MIN_LOG_LEVEL"}
     words = [sys.executable, "-c", HELP]
     done = subprocess.run(words, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stderr) == (0, "")
-    flags = [flag for one in COMMANDS.values() for flag in (*one.particular, *one.shared.split())]
-    assert all(flag in done.stdout for flag in flags)
+    assert all(flag in done.stdout for flag in EVERY)
 
 
 def test_a_warning_for_users_is_one_line_and_shown_once(capfd, monkeypatch):
@@ -211,3 +226,87 @@ def test_the_first_step_does_not_count_once_there_are_others(monkeypatch):
         "layerjax: map 13/40 (about 9 min left; fine)",
         "layerjax: map 40/40 (fine)",
     ]
+
+
+def test_messages_name_flags_that_exist_and_these_are_few():
+    assert sum(name.startswith("--") for name in EVERY) < 91
+    unknown = [
+        (flag, path.name)
+        for path in sorted((ROOT / "fits").rglob("*.py"))
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.Constant) and isinstance(node.value, str)
+        for flag in re.findall(r"(?<![\w-])--[a-z][a-z-]+", node.value)
+        if flag not in OTHERS.union(EVERY)
+    ]
+    assert not unknown
+
+
+@pytest.mark.parametrize(("page", "line"), [pytest.param(*one, id=f"{one[0].stem}-{k}") for k, one in enumerate(SHOWN)])
+def test_commands_of_pages_are_understood(page, line):
+    words = shlex.split(line, comments=True)[1:]
+    build_parser().parse_args(["rgl" if word == "FORMAT" else word for word in words])
+
+
+def made(path, failing=0, chunks=None):
+    """A store of ten texels: two masked, eight fitted, all but so many of these converged; or only its first chunks."""
+    arrays, place = numbers((2, 5)), np.arange(10.0).reshape(2, 5)
+    arrays["values/base.albedo"] = place.copy()
+    arrays["flags"][place < failing] &= ~np.uint16(FLAGS["converged"])
+    without(arrays, place >= 8, "masked")
+    shutil.rmtree(path, ignore_errors=True)
+    return stored(path, arrays, (1, 5), chunks=chunks)
+
+
+@pytest.fixture
+def fit_map(work, monkeypatch):
+    """The command with further words, and a map that is made up: its exit code, and what `fits.fit_map` is given."""
+
+    def run(words="", **state):
+        given = {}
+
+        def made_up(*arguments, options, **rest):
+            given.update(zip(("stack", "geometry", "values", "out"), arguments, strict=True), **rest)
+            given["options"] = replace(options, progress=None)
+            options.progress("texels", 5, 10)
+            return made(work / "found.zarr", **state)
+
+        monkeypatch.setattr("fits.maps.fit_map.fit_map", made_up)
+        return main([*WORDS, *words.split()]), given
+
+    return run
+
+
+def test_defaults_and_options_of_fit_map_arrive(work, fit_map):
+    code, given = fit_map()
+    assert (code, given.pop("options")) == (0, fits.MapOptions())
+    assert isinstance(given.pop("stack"), lj.Stack)
+    assert isinstance(given.pop("transport"), lj.SingleScattering)
+    places = {"geometry": "view.csv", "values": "map.npy", "out": "coat.zarr", "sigma": None, "mask": None}
+    assert given == {**places, "noise": fits.Noise(), "client": None}
+    # the stack file says what no option does
+    more = "[noise]\nrelative = 0.1\ntails = 'student'\n[scale]\nstart = 1\nlow = 0.8\nhigh = 1.2\n"
+    (work / "coat.toml").write_text((work / "coat.toml").read_text() + more)
+    _, given = fit_map(
+        "--sigma sigma.npy --mask mask.npy --noise 0.02 --starts 3 --seed 5 --pilot-texels 9 --chunk-size 100 --force "
+        "--processes 3 --emulator never --spatial-prior gaussian --spatial-scale 0.1"
+    )
+    counts = {"starts": 3, "seed": 5, "pilot_texels": 9, "chunk_size": 100, "processes": 3}
+    more = {"emulator": False, "force": True, "spatial_prior": fits.SpatialPrior("gaussian", 0.1)}
+    assert given["options"] == fits.MapOptions(scale=fits.Free(1, 0.8, 1.2), **counts, **more)
+    assert (given["sigma"], given["mask"]) == ("sigma.npy", "mask.npy")
+    assert given["noise"] == fits.Noise(0.02, tails="student")
+    _, given = fit_map("--scheduler tcp://10.0.0.1:8786 --emulator always")
+    assert given["client"] == "tcp://10.0.0.1:8786"
+    assert given["options"].emulator
+
+
+def test_what_was_found_is_printed_and_a_map_that_did_not_converge_is_doubtful(fit_map, capsys):
+    assert fit_map()[0] == 0
+    output = capsys.readouterr()
+    rows = {line.split("  ")[0].strip(): line.split() for line in reversed(output.out.splitlines()) if line.strip()}
+    assert "A map of 10 texels: 8 are fitted, 2 masked.\n100 % of the fitted texels converged." in output.out
+    assert rows["base.albedo"][1:4] == ["1.75", "3.5", "5.25"]  # quartiles of 0 to 7
+    assert rows["layers[0].f0"] == ["layers[0].f0", "0.04321", "0.00012", "1"]
+    assert "layerjax report coat.zarr" in output.out
+    assert "texels 5/10" in output.err
+    assert fit_map(failing=1)[0] == fit_map(chunks=1)[0] == 1

@@ -1,18 +1,29 @@
-"""Bad input and bad usage of `layerjax`: one line on stderr, exit code 2, and nothing written."""
+"""Bad input and usage, interrupts, full disks and a second process: one line, nothing is lost, and work is resumed."""
 
 import shutil
+import sys
+from pathlib import Path
 from unittest.mock import Mock
 
 import jax
+import numpy as np
 import pytest
 
+from fits import save_fit
+from fits._files import locked
 from fits.cli.commands import COMMANDS
 from fits.cli.parser import main
-from fits.reports.results import save_fit
+from fits.optimise import multi_start as starts
+from fits.reports.html import FitReport
+from fits.store import Store
+from tests.helpers import kills
+from tests.helpers.coats import make_folder
 from tests.helpers.commands import refused
-from tests.helpers.files import contents
+from tests.helpers.files import contents, largest_file, read_only
+from tests.helpers.stores import keys
 
-FIT = "fit data.csv --stack coat.toml --out result"
+FIT, MANY = "fit data.csv --stack coat.toml --out result", "fit-many scans --stacks coat.toml --out out"
+MAP = "fit-map map.npy --geometry view.csv --stack coat.toml --out coat.zarr"
 
 REFUSALS = (
     ("info nowhere.csv", "nowhere.csv"),
@@ -42,8 +53,15 @@ REFUSALS = (
     ("predict saved --incidence 30 --out new.csv --select azimuth=0", "--select is given without --score"),
     ("predict saved --score data.csv --azimuth 90", "--azimuth is given without --incidence"),
     ("render fabrik --out a.png", "neither a .toml file nor a material of the gallery: brushed_aluminium"),
-    ("fit-many scans", "no stack is given"),
+    (MAP.replace("map.npy", "nowhere.npy"), "nowhere.npy: no such file"),
+    (MAP.replace("map.npy", "."), "layerjax fit-many"),
+    (MAP.replace("view.csv", "coat.toml"), "coat.toml, line"),
+    (MAP.replace("coat.zarr", "file.zarr"), "file.zarr: is no store of a fitted map"),
+    (MAP.replace("coat.zarr", "coat.h5"), "coat.h5: a fitted map can be written as .zarr only"),
+    (f"{MAP} --spatial-prior gaussian", "--spatial-prior needs --spatial-scale"),
+    ("fit-many scans --out out", "no stack is given"),
 )
+FIT_MANY = ["fit-many", "scans", "--stacks", "bare.toml", "--out", "out", "--starts", "2", "--processes", "1"]
 
 
 @pytest.mark.parametrize(("command", "fragment"), REFUSALS)
@@ -56,11 +74,11 @@ def test_refusals(work, capsys, coat_fit, command, fragment):
     if "fit-many" in command:
         (work / "scans").mkdir()
         shutil.copy("data.csv", "scans")
-        command = f"{command} --out out"
+    if "fit-map" in command:
+        np.save(work / "map.npy", np.ones((5, 1)))
+        (work / "view.csv").write_text("theta_i,phi_i,theta_o,phi_o\n10,180,20,0\n")
+        (work / "file.zarr").touch()
     assert fragment in refused(command.split(), capsys, work)
-
-
-MAP, MANY = "fit-map map.npy --stack coat.toml --out coat.zarr", "fit-many scans --stacks coat.toml --out out"
 
 
 @pytest.mark.parametrize(
@@ -91,13 +109,13 @@ def test_bad_usage(work, capsys, command, fragment):
     assert fragment in error
 
 
-def test_a_cluster_that_is_not_there_is_named(work, capsys):
+def test_a_cluster_that_is_not_there_is_named(work, layerjax):
     dask = pytest.importorskip("dask")
     pytest.importorskip("distributed")
-    words = ["fit-many", "data.csv", "--stacks", "coat.toml", "--out", "out", "--scheduler", "tcp://127.0.0.1:9"]
+    words = "fit-many data.csv --stacks coat.toml --out out --scheduler tcp://127.0.0.1:9"
     with dask.config.set({"distributed.comm.timeouts.connect": "1s"}):
-        assert main(words) == 2
-    assert "tcp://127.0.0.1:9: there is no scheduler" in capsys.readouterr().err.splitlines()[-1]
+        said = layerjax(words, 2).err
+    assert "tcp://127.0.0.1:9: there is no scheduler" in said.splitlines()[-1]
 
 
 def test_errors_of_the_machine_are_one_line_and_those_of_the_program_have_their_traceback(work, capsys, monkeypatch):
@@ -111,3 +129,100 @@ def test_errors_of_the_machine_are_one_line_and_those_of_the_program_have_their_
     monkeypatch.setitem(COMMANDS, "info", Mock(side_effect=KeyError))
     with pytest.raises(KeyError):
         main(["info", "data.csv"])
+
+
+def refusal(words, capsys):
+    """The one error line of a command that must fail, after what it says of its progress."""
+    assert main(words) == 2
+    *progress, error = capsys.readouterr().err.splitlines()
+    assert error.startswith("layerjax: error: ")
+    assert not any("error" in line for line in progress)
+    return error
+
+
+@pytest.mark.parametrize(
+    ("place", "words", "hint"),
+    [
+        (
+            "fits.batch.fit_file",
+            FIT.replace("result", "new").split(),
+            "new was not written; the same command resumes with the starts",
+        ),
+        ("fits.sampling.sample.sample", ["sample", "result"], "the chain is kept, `layerjax sample result` resumes it"),
+        ("fits.batch.fit_one", FIT_MANY, "out keeps what was fitted; the same command resumes it"),
+        ("fits.maps.fit_map.fit_map", MAP.split(), "coat.zarr keeps what was fitted; the same command resumes it"),
+        ("fits.structure_search.search", ["search", "data.csv", "--out", "out"], "out keeps what was fitted"),
+    ],
+)
+def test_an_interrupt_says_how_to_resume(work, capsys, coat_fit, monkeypatch, place, words, hint):
+    save_fit(coat_fit, "result")
+    make_folder(work)
+    monkeypatch.setattr(place, Mock(side_effect=KeyboardInterrupt))
+    assert main(words) == 130
+    assert hint in capsys.readouterr().err
+    assert (work / "out" / "table.csv").is_file() == (words is FIT_MANY)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", kills.COMMANDS)
+def test_a_command_that_is_killed_resumes_with_the_same_result(monkeypatch, name):
+    monkeypatch.setattr(kills, "COMMANDS", {name: kills.COMMANDS[name]})
+    assert kills.main(1) == 0
+
+
+@pytest.mark.parametrize(
+    ("words", "name"),
+    [
+        ("convert data.csv out.csv --force", "out.csv"),
+        ("info data.csv --out out.png --force", "out.png"),
+        ("report one", "one/report.html"),
+        ("sample one", "one/chain.db"),
+    ],
+)
+def test_a_full_disk_is_one_line_and_changes_nothing(work, capsys, coat_fit, words, name):
+    save_fit(coat_fit, "one")
+    for output in ("out.csv", "out.png", "one/report.html"):
+        (work / output).write_text("precious")
+    before = contents(work)
+    with largest_file(6_000):
+        error = refusal(words.split(), capsys)
+    assert error.startswith(f"layerjax: error: {name}: ")
+    assert error.endswith(("file too large", "quota allows"))
+    after = contents(work)
+    assert (after.pop(str(work / "one" / "chain.db"), b""), after) == (b"", before)
+
+
+def test_a_full_disk_behind_stdout_is_one_line(work, capsys, monkeypatch):
+    if not Path("/dev/full").exists():
+        pytest.skip("there is no /dev/full")
+    with open("/dev/full", "w") as full:  # closing it fails if anything is left to be written
+        monkeypatch.setattr(sys, "stdout", full)
+        assert "No space left on device" in refusal(["convert", "data.csv", "out.csv"], capsys)
+
+
+def test_the_report_of_a_result_that_can_only_be_read_goes_elsewhere(work, capsys, coat_fit, monkeypatch):
+    monkeypatch.setattr(FitReport, "page", lambda _: "drawn")
+    save_fit(coat_fit, "result")
+    with read_only(work / "result"):
+        assert refusal(["report", "result"], capsys).startswith("layerjax: error: result/report.html: ")
+        assert main(["report", "result", "--out", "report.html"]) == 0
+        assert "chain.db.lock: " in refusal(["sample", "result"], capsys)
+    assert (work / "report.html").read_text() == "drawn"
+    assert "--force" in refusal(["report", "result", "--out", "report.html"], capsys)
+
+
+def test_a_fit_on_a_full_disk_keeps_its_starts_and_the_earlier_result(work, capsys, coat_fit, monkeypatch):
+    save_fit(coat_fit, "result")
+    before = contents(work)
+    words = [*FIT.split(), "--starts", "3", "--force"]
+    with largest_file(30_000):
+        assert refusal(words, capsys) == "layerjax: error: result/report.html: file too large"
+    kept = (work / ".result.starts").read_bytes()
+    assert len(keys(Store.read(".result.starts"))) == 3
+    with locked(work / ".result.lock", "result"):
+        assert "result is in use by another process" in refusal(words, capsys)
+    assert contents(work) == {**before, str(work / ".result.starts"): kept}
+    monkeypatch.setattr(starts, "rough_descent", pytest.fail)  # no start is run again
+    monkeypatch.setattr(FitReport, "write", lambda *_: None)
+    assert main(words) == 0
+    assert not list(work.glob(".*"))
