@@ -1,5 +1,7 @@
 """Texts as files, and the bytes of one file of every format."""
 
+import functools
+
 import pytest
 
 from fits.data.reading import read
@@ -15,11 +17,5 @@ def reading(tmp_path):
 @pytest.fixture(scope="session")
 def made(tmp_path_factory):
     """The bytes of a file of a format, made once."""
-    folder, kept = tmp_path_factory.mktemp("files"), {}
-
-    def of(kind: str) -> bytes:
-        if kind not in kept:
-            kept[kind] = FILES[kind](folder)
-        return kept[kind]
-
-    return of
+    folder = tmp_path_factory.mktemp("files")
+    return functools.cache(lambda kind: FILES[kind](folder))

@@ -8,9 +8,14 @@ from fits.data.geometry import direction
 from fits.data.scans import in_plane, incidences, relative_azimuth
 from tests.helpers.data_files import written
 from tests.helpers.merl import SCALE, SHAPE, centre_angles, centre_pairs, half_angles, smooth_bsdf, write_merl
+from tests.helpers.refusals import refuses
 
 HEADER = np.array(SHAPE, "<i4").tobytes()
 SIZE = len(HEADER) + 8 * 3 * np.prod(SHAPE)
+COUNT = 3000
+RANDOM = np.random.default_rng(5)
+THETA, PHI = RANDOM.uniform(2, 65, (2, 300)), RANDOM.uniform(0, 360, (2, 300))
+GEOMETRY = Geometry(direction(THETA[0], PHI[0]), direction(THETA[1], PHI[1]))
 
 
 @pytest.fixture(scope="module")
@@ -30,21 +35,13 @@ def angles_of(pairs):
 
 
 def bins_of(pairs):
-    """Table indices (N, 3)."""
     theta_h, theta_d, phi_d = angles_of(pairs) * 2 / np.pi
     return np.floor(np.stack([np.sqrt(theta_h), theta_d, phi_d / 2], axis=-1) * SHAPE).astype(int)
 
 
-@pytest.fixture(scope="module")
-def geometry():
-    random = np.random.default_rng(5)
-    theta, phi = random.uniform(2, 65, (2, 300)), random.uniform(0, 360, (2, 300))
-    return Geometry(direction(theta[0], phi[0]), direction(theta[1], phi[1]))
-
-
-def test_centre_lookup_reads_bins_as_they_are_at_their_centre_angles_near_those_requested(path, geometry, table):
-    some = Geometry(geometry.wi[:50], geometry.wo[:50])
-    for data in (read(path), read(path, geometry=geometry), read(path, geometry=some)):
+def test_centre_lookup_reads_bins_as_they_are_at_their_centre_angles_near_those_requested(path, table):
+    some = Geometry(GEOMETRY.wi[:50], GEOMETRY.wo[:50])
+    for data in (read(path), read(path, geometry=GEOMETRY), read(path, geometry=some)):
         index = bins_of(data)
         centres = ((index + 0.5) / SHAPE) ** [2, 1, 1] * [np.pi / 2, np.pi / 2, np.pi]
         np.testing.assert_allclose(angles_of(data).T, centres, rtol=0, atol=1e-9)
@@ -91,14 +88,13 @@ def test_light_along_the_normal_and_pairs_at_the_horizon(path):
     # half a degree of phi_d puts one of the two below the horizon in every bin near this pair
     low = direction([89.996, 30], 180), direction([89.996, 30], [4.78, 0])
     assert len(read(path, geometry=Geometry(*low))) == 1
-    with pytest.raises(ValueError, match="geometry holds only pairs too near the horizon"):
-        read(path, geometry=Geometry(low[0][:1], low[1][:1]))
+    refuses("geometry holds only pairs too near the horizon", read, path, geometry=Geometry(low[0][:1], low[1][:1]))
 
 
-def test_linear_lookup_recovers_the_formula_and_the_nearest_is_that_of_the_database_code(path, geometry, table):
-    data = read(path, geometry=geometry, lookup="linear")
-    np.testing.assert_array_equal([data.wi, data.wo], [geometry.wi, geometry.wo])
-    expected = smooth_bsdf(*angles_of(geometry)).T
+def test_linear_lookup_recovers_the_formula_and_the_nearest_is_that_of_the_database_code(path, table):
+    data = read(path, geometry=GEOMETRY, lookup="linear")
+    np.testing.assert_array_equal([data.wi, data.wo], [GEOMETRY.wi, GEOMETRY.wo])
+    expected = smooth_bsdf(*angles_of(GEOMETRY)).T
     # linear interpolation is off by at most an eighth of the second difference along each axis
     bound = sum(abs(np.diff(table, 2, axis=axis)).max(axis=(1, 2, 3)) for axis in (1, 2, 3)) / 8
     assert (abs(data.values - expected) <= 1.05 * bound).all()
@@ -110,8 +106,8 @@ def test_linear_lookup_recovers_the_formula_and_the_nearest_is_that_of_the_datab
     data, expected = read(path, geometry=edges, lookup="linear"), smooth_bsdf(*angles_of(edges)).T
     assert data.mask.all()
     np.testing.assert_allclose(data.values[:, :2], expected[:, :2], rtol=0.02)
-    data = read(path, geometry=geometry, lookup="nearest")
-    np.testing.assert_allclose(data.values, table[:, *bins_of(geometry).T].T, rtol=1e-14)
+    data = read(path, geometry=GEOMETRY, lookup="nearest")
+    np.testing.assert_allclose(data.values, table[:, *bins_of(GEOMETRY).T].T, rtol=1e-14)
 
 
 def test_bins_that_hold_nan_are_left_out_and_counted(tmp_path, path, table):
@@ -149,9 +145,6 @@ def test_bins_without_measurement_are_masked_and_every_other_is_read_once(holed)
     np.testing.assert_allclose(data.values, values[:, *bins.T].T, rtol=1e-12)
     assert data.mask.all()
     np.testing.assert_allclose(data.phi_i, 180.0, atol=1e-8)
-
-
-COUNT = 3000
 
 
 @pytest.mark.parametrize("strata", ["bins", "flux"])
@@ -194,8 +187,7 @@ def test_bad_arguments(path):
         ({"bins": 10, "seed": -1}, "seed is -1, must be a whole number"),
         ({"bins": 10, "lookup": "linear"}, "bins stands beside geometry or lookup"),
     ):
-        with pytest.raises(ValueError, match=message):
-            read(path, **given)
+        refuses(message, read, path, **given)
 
 
 def test_bad_files(tmp_path):
@@ -211,7 +203,5 @@ def test_bad_files(tmp_path):
         (filled(np.inf), "the table holds inf, must be finite"),
     ):
         path = written(tmp_path, content, "bad.binary")
-        with pytest.raises(ValueError, match=message):
-            read(path)
-    with pytest.raises(ValueError, match="no bin holds a measurement"):
-        read(written(tmp_path, filled(-1.0), "bad.binary"), bins="all")
+        refuses(message, read, path)
+    refuses("no bin holds a measurement", read, written(tmp_path, filled(-1.0), "bad.binary"), bins="all")

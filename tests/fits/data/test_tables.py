@@ -19,6 +19,13 @@ PAB = """#sample_name "a sample"
 LIT = "azimuths about the normal"
 SKIPPED = "ScatterRadial and|skipped: 0 grid points at|masked: 1 zero above the horizon, not measured"
 BLOCK = ZEMAX[ZEMAX.index("TIS") : ZEMAX.index("DataEnd")]
+SIDES = [[("Front", side), ("BRDF", kind)] for side in ("Front", "Back") for kind in ("BRDF", "BTDF")]
+COLOURS = [
+    [("Wavelength 550", f"TristimulusValue Tris{name}"), ("1 2", f"{first} 2")]
+    for name, first in (("Y", 8), ("X", 7), ("Z", 9))
+]
+XYZ = "".join(f"Tristimulus{name}\nDataBegin\n{BLOCK}DataEnd\n" for name in "XYZ")
+TURNED = [("1\n0\n", "2\n0 30\n"), ("0 90 180", "0 120 240"), (BLOCK, BLOCK * 2)]
 
 
 def lighttools(*tables, spectrum="Monochrome"):
@@ -50,15 +57,6 @@ def about_specular(theta, *values, phi_i=180.0, below=0, turns=(0, 90, 180)):
         )
         rows.append((theta, phi_i, polar(away), azimuth(away) + phi_i + 180.0, value))
     return [(*row[:2], abs(below - row[2]), *row[3:]) for row in rows]
-
-
-SIDES = [[("Front", side), ("BRDF", kind)] for side in ("Front", "Back") for kind in ("BRDF", "BTDF")]
-COLOURS = [
-    [("Wavelength 550", f"TristimulusValue Tris{name}"), ("1 2", f"{first} 2")]
-    for name, first in (("Y", 8), ("X", 7), ("Z", 9))
-]
-XYZ = "".join(f"Tristimulus{name}\nDataBegin\n{BLOCK}DataEnd\n" for name in "XYZ")
-TURNED = [("1\n0\n", "2\n0 30\n"), ("0 90 180", "0 120 240"), (BLOCK, BLOCK * 2)]
 
 
 def plain(**how):
@@ -188,10 +186,7 @@ def test_a_fred_file_is_the_csv_plus_the_laboratory_floor():
 
 
 def test_a_zemax_file_is_measured_up_to_80_degrees_from_the_normal():
-    """The instrument stopped at theta_o = 80: the file's zeros must lie beyond it, and all its values within.
-
-    Radial angles about the normal, or azimuths counted from the other side, would scatter both over all theta_o.
-    """
+    """There its zeros must lie: angles about the normal, or azimuths from the other side, would scatter them."""
     steel = read(COATINGS / "AnoBlackNiTEonSteel.bsdf")
     assert (steel.theta_o[steel.mask] <= 80 + 1e-9).all()
     assert (steel.theta_o[~steel.mask] > 80).all()

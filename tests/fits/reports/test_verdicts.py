@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from fits import Direction, Discrepancy, Fit, Noise, Problem, fit
+from fits import Direction, Discrepancy, Noise, Problem, fit
 from fits.data.scans import correlation, neighbours, signed_angle
 from fits.prediction.predict import with_discrepancy
 from fits.reports import tables, verdicts
@@ -22,18 +22,23 @@ NOISE = Noise(relative=0.02, floor=1e-4, discrepancy=True)
 FIRST, SECOND, WEAKLY = "layers[0].thickness", "base.albedo", "weakly identified: see direction"
 TOGETHER = Direction(0.3, {FIRST: 0.8, SECOND: -0.6}, {FIRST: 0.01, SECOND: 0.02})
 TERM = SimpleNamespace(amplitude=0.05, grazing_exponent=0.5, length_half=18.0, length_difference=11.0)
+MOSTLY = Direction(0.6, {FIRST: 0.9996, SECOND: 0.028}, {FIRST: 0.01, SECOND: 0.02})
+OTHER = Direction(0.2, {SECOND: 0.9996, FIRST: 0.028}, {FIRST: 0.01, SECOND: 0.02})
+BROAD = Direction(1.5, {FIRST: 0.94, SECOND: 0.34}, {FIRST: 0.01, SECOND: 0.02})
+UNKNOWN = Direction(np.inf, {FIRST: 1.0}, {FIRST: np.inf})
+SEPARATELY = f"{FIRST} and {SECOND} are not identified separately"
 
 
-def simulated(seed: int) -> Problem:
+def simulated(seed):
     return Problem(POSITIVE_LINE, wrong_line(seed, Discrepancy(*TRUTH[2:])), line, NOISE)
 
 
 @pytest.fixture(scope="module")
-def fitted() -> Fit:
+def fitted():
     return fit(POSITIVE_LINE, simulated(0).data, transport=line, noise=NOISE, starts=1)
 
 
-def test_no_two_statements_contradict_each_other(coat_fit: Fit) -> None:
+def test_no_two_statements_contradict_each_other(coat_fit):
     """A report once said that sigma is too large, errors by 2, and that correlation makes errors too small by 4.4."""
     facts = assess(coat_fit)
     parameters = ["identified", f"correlated with {SECOND} +0.97", f"{WEAKLY} 1", "at a bound", "insensitive: no"]
@@ -64,7 +69,7 @@ def test_no_two_statements_contradict_each_other(coat_fit: Fit) -> None:
     assert count > 10_000
 
 
-def test_one_statement_weighs_size_and_correlation_of_residuals(coat_fit: Fit) -> None:
+def test_one_statement_weighs_size_and_correlation_of_residuals(coat_fit):
     facts = assess(coat_fit)
     case = replace(facts, excess=-9.0, ratio=0.19, lag_one=0.9, discrepancy=(TERM, 0.9))
     factor = np.sqrt(0.19) * np.sqrt(1.9 / 0.1)  # (1 + r) / (1 - r) for the correlation
@@ -74,7 +79,7 @@ def test_one_statement_weighs_size_and_correlation_of_residuals(coat_fit: Fit) -
     assert "within 4 % of the model, 95 % within a factor of 3" in verdicts.statements(far)["verdict"][0].sentence
 
 
-def test_the_verdict_is_three_sentences_and_quotes_the_misfit(coat_fit: Fit) -> None:
+def test_the_verdict_is_three_sentences_and_quotes_the_misfit(coat_fit):
     found, facts = verdicts.verdict(coat_fit), assess(coat_fit)
     assert len(found.sentences) == 3
     assert found.sound
@@ -89,7 +94,7 @@ def test_the_verdict_is_three_sentences_and_quotes_the_misfit(coat_fit: Fit) -> 
         assert not verdicts.verdict(coat_fit, replace(facts, **change)).sound
 
 
-def test_residuals_of_the_assumed_model_are_independent_standard_normal(fitted: Fit) -> None:
+def test_residuals_of_the_assumed_model_are_independent_standard_normal(fitted):
     """Six sets that are drawn from the model itself, at its true parameters."""
     residuals, pairs = [], []
     for seed in range(6):
@@ -105,7 +110,7 @@ def test_residuals_of_the_assumed_model_are_independent_standard_normal(fitted: 
     assert np.mean(misfit(fitted) ** 2) < np.mean(standardised(fitted) ** 2)
 
 
-def test_a_stack_that_misses_is_named_though_the_discrepancy_absorbs_all(fitted: Fit) -> None:
+def test_a_stack_that_misses_is_named_though_the_discrepancy_absorbs_all(fitted):
     off = replace(fitted, vector=fitted.vector * np.array([1.4, 1.4, 3.0, 1.0, 1.0, 1.0]))
     assert off.reduced_chi_square < 1.5
     found = verdicts.verdict(off)
@@ -125,7 +130,7 @@ def test_a_stack_that_misses_is_named_though_the_discrepancy_absorbs_all(fitted:
     assert assess(replace(fitted, problem=wide, unidentified=(), **true)).described
 
 
-def test_both_curves_are_drawn_and_the_residuals_are_those_of_the_one_with_the_discrepancy(fitted: Fit) -> None:
+def test_both_curves_are_drawn_and_the_residuals_are_those_of_the_one_with_the_discrepancy(fitted):
     figure = curves_picture({"model": fitted})
     assert isinstance(figure, Figure)
     assert len(figure.axes) == 8  # four incidences, each with its residuals
@@ -143,7 +148,7 @@ def test_both_curves_are_drawn_and_the_residuals_are_those_of_the_one_with_the_d
     np.testing.assert_allclose(np.asarray(points.get_ydata()), (values - drawn) / (0.02 * values), atol=0.15)
 
 
-def test_noise_that_is_assumed_is_announced(coat_fit: Fit) -> None:
+def test_noise_that_is_assumed_is_announced(coat_fit):
     (words,) = verdicts.statements(replace(assess(coat_fit), noise_assumed=True))["remarks"]
     assert words.sentence.startswith("No noise is stated: 5 % of the model's value is assumed.")
     for noise, sigma, said in (
@@ -152,13 +157,6 @@ def test_noise_that_is_assumed_is_announced(coat_fit: Fit) -> None:
         (Noise(relative=0.03, use_sigma=False, tails="student"), 0.04, "0.03 of the model's value, "),
     ):
         assert tables.noise_in_words(Problem(POSITIVE_LINE, along(SCANS, 1.0, sigma), line, noise)).startswith(said)
-
-
-MOSTLY = Direction(0.6, {FIRST: 0.9996, SECOND: 0.028}, {FIRST: 0.01, SECOND: 0.02})
-OTHER = Direction(0.2, {SECOND: 0.9996, FIRST: 0.028}, {FIRST: 0.01, SECOND: 0.02})
-BROAD = Direction(1.5, {FIRST: 0.94, SECOND: 0.34}, {FIRST: 0.01, SECOND: 0.02})
-UNKNOWN = Direction(np.inf, {FIRST: 1.0}, {FIRST: np.inf})
-SEPARATELY = f"{FIRST} and {SECOND} are not identified separately"
 
 
 @pytest.mark.parametrize(
@@ -177,9 +175,7 @@ SEPARATELY = f"{FIRST} and {SECOND} are not identified separately"
         (0.0, (BROAD,), (), ("unidentified: see direction 1", f"{WEAKLY} 1"), f"{SEPARATELY}."),
     ],
 )  # fmt: skip
-def test_unidentified_directions_and_bounds_are_named(
-    coat_fit: Fit, correlated: float, directions: tuple, at_bound: tuple, words: tuple, sentence: str
-) -> None:
+def test_unidentified_directions_and_bounds_are_named(coat_fit, correlated, directions, at_bound, words, sentence):
     covariance = np.array([[1.0, correlated], [correlated, 1.0]]) * np.outer(coat_fit.errors, coat_fit.errors)
     case = replace(coat_fit, covariance=covariance, unidentified=directions, at_bound=at_bound)
     assert identifiability(case) == dict(zip((FIRST, SECOND), words, strict=True))
