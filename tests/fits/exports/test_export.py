@@ -1,4 +1,7 @@
-"""Files of materials: what each says when it is read again, beside what the stack gives."""
+"""Files of materials: what each says when it is read again, by us and by Mitsuba, beside what the stack gives."""
+
+import contextlib
+import io
 
 import numpy as np
 import pytest
@@ -17,7 +20,10 @@ GLOSSY = lj.Stack([lj.Interface(1.5, 0.05)], lj.Lambertian([0.5, 0.3, 0.1]))
 FIBERS = lj.Stack([lj.Medium(1.0, 0.9, lj.SGGX("fiber", 0.5, (1.0, 0.4, 0.0)))], lj.Lambertian(0.3))
 TILTED = lj.Stack([lj.Medium(1.0, 0.9, lj.SGGX("surface", 0.5, (0.3, 0.1, 1.0)))], lj.Lambertian(0.3))
 LYING = (1.0, 0.4, 0.0)
+ROUGH = lj.Stack([], lj.Conductor([0.2, 0.9, 1.1], [3.9, 2.4, 2.2], 0.3))
 HAZE = lj.Stack([lj.Medium(0.7, [0.9, 0.8, 0.7], lj.HenyeyGreenstein(0.3))])
+TWO = lj.Stack([], lj.Lambertian([0.1, 0.2]))
+SINGLE = {"transport": lj.SingleScattering()}
 
 
 def written(material, tmp_path, to, **options):
@@ -31,7 +37,6 @@ def written(material, tmp_path, to, **options):
 
 
 def agrees(data, stack, transport, tolerance):
-    """Readings are the values of the stack at their own directions."""
     true = np.asarray(lj.evaluate(stack, data.wi, data.wo, transport))
     np.testing.assert_allclose(data.values, np.broadcast_to(true, data.values.shape), rtol=tolerance)
 
@@ -55,8 +60,7 @@ def error_of(path, stack, transport):
     ids=["metal", "glossy", "fibers", "tilted flakes"],
 )
 def test_an_rgl_file_holds_the_stack(tmp_path, stack, transport, share, azimuths):
-    """To 1 %, and to 0.3 % in the median; share: of pairs that are, where azimuths of the light are nodes as well, and
-    as many of them as the stack needs."""
+    """To 1 % of a share of pairs, 0.3 % in the median, with as many azimuths of the light as the stack needs."""
     path, notes = written(stack, tmp_path, "rgl", transport=transport)
     table = read_table(path)
     assert (len(table.phi_i), table.turns) == azimuths
@@ -97,15 +101,12 @@ def test_a_spectral_file_has_its_wavelengths(tmp_path):
     agrees(data, METAL, lj.SingleScattering(), 2e-5)
 
 
-def test_a_merl_table_holds_the_stack_at_its_bins(tmp_path):
+def test_a_merl_table_holds_the_stack_at_its_bins_and_says_that_light_passes(tmp_path, monkeypatch):
     path, notes = written(METAL, tmp_path, "merl", transport=lj.SingleScattering())
     view = fits.slices((10.0, 40.0, 65.0), azimuth=(0.0, 40.0, 110.0))
     agrees(fits.read(path, geometry=view), METAL, lj.SingleScattering(), 1e-9)
     assert any("in the median" in note for note in notes)
     assert not any("passes through" in note for note in notes)
-
-
-def test_a_merl_table_says_that_light_passes(monkeypatch):
     monkeypatch.setattr(Material, "values", lambda self, wi, wo, stage="": np.ones((len(wi), 3)))
     notes = merl.contents(material_of(HAZE, lj.SingleScattering())).notes
     assert any("transmission is omitted" in note for note in notes)
@@ -141,10 +142,6 @@ def test_slices_hold_the_stack_or_the_best_of_a_fit_on_both_sides(tmp_path, coat
     agrees(fits.read(path), coat_fit.stack, coat_fit.problem.transport, 1e-12)
 
 
-TWO = lj.Stack([], lj.Lambertian([0.1, 0.2]))
-SINGLE = {"transport": lj.SingleScattering()}
-
-
 def test_what_cannot_be_written_is_named(tmp_path):
     for material, name, to, options, message in (
         (METAL, "x.bsdf", "obj", {}, "to is 'obj', must be one of rgl, merl"),
@@ -177,3 +174,48 @@ def test_on_the_command_line(work, capsys, layerjax):
     assert "data points" in layerjax("export coat.toml --to csv --out coat.csv").out
     assert len(fits.read(work / "coat.csv")) > 1000
     assert "exists already" in refused(["export", "coat.toml", "--to", "csv", "--out", "coat.csv"], capsys, work)
+
+
+@pytest.fixture(scope="module", params=["rough", "glossy"])
+def measured(request, tmp_path_factory):
+    stack, transport = (ROUGH, lj.SingleScattering()) if request.param == "rough" else (GLOSSY, lj.Statistical())
+    path = tmp_path_factory.mktemp("rgl") / f"{request.param}.bsdf"
+    fits.export(stack, path, "rgl", transport=transport)
+    return stack, transport, path
+
+
+@pytest.mark.peers
+def test_mitsuba_finds_the_stack(measured):
+    mi = pytest.importorskip("mitsuba")
+    mi.set_variant("scalar_rgb")
+    stack, transport, path = measured
+    bsdf = mi.load_dict({"type": "measured", "filename": str(path)})
+    wi, wo = (w[::8] for w in pairs())
+    true = np.asarray(lj.evaluate(stack, wi, wo, transport)) * wo[:, 2:]
+    found = []
+    for one, other in zip(wi, wo, strict=True):
+        at = mi.SurfaceInteraction3f()
+        at.wi = mi.ScalarVector3f(*one)
+        found.append(np.array(bsdf.eval(mi.BSDFContext(), at, mi.ScalarVector3f(*other))))
+    error = np.max(abs(np.array(found) / true - 1.0), axis=1)
+    assert np.median(error) < 0.003
+    assert np.max(error) < 0.01
+
+
+@pytest.mark.peers
+@pytest.mark.parametrize("light", [(0.3, 0.2, 0.93), (0.8, 0.0, 0.6)])
+def test_mitsuba_draws_as_the_file_says(measured, light):
+    mi = pytest.importorskip("mitsuba")
+    try:
+        mi.set_variant("llvm_ad_rgb")
+    except Exception as error:
+        pytest.skip(f"no LLVM: {error}")
+    _, _, path = measured
+    wi = (np.array(light) / np.linalg.norm(light)).tolist()
+    sample, density = mi.chi2.BSDFAdapter("measured", f'<string name="filename" value="{path}"/>', wi=wi)
+    test = mi.chi2.ChiSquareTest(
+        domain=mi.chi2.SphericalDomain(), sample_func=sample, pdf_func=density, sample_dim=3, res=201
+    )
+    with contextlib.redirect_stdout(io.StringIO()):
+        passed = test.run()
+    assert passed

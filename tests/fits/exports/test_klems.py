@@ -1,4 +1,4 @@
-"""Matrices of WINDOW: sums, symmetries and sides, beside the stack; the readers of others are in `test_readers`."""
+"""Matrices of WINDOW: sums, symmetries and sides, beside the stack, also as Radiance reads them."""
 
 import itertools
 import xml.etree.ElementTree as ElementTree
@@ -14,6 +14,9 @@ FIBERS = lj.Medium(0.7, 0.9, lj.SGGX("fiber", 0.4, (1.0, 0.5, 0.6)))
 SHEET = lj.Stack([lj.Medium(0.3, 0.0), FIBERS])  # what absorbs is on top: front and back differ
 COUNTS = (1, 8, 16, 20, 24, 24, 24, 16, 12)
 BOUNDS = (0, 5, 15, 25, 35, 45, 55, 65, 75, 90)
+PROJECTED = np.repeat(-np.pi * np.diff(np.cos(np.radians(BOUNDS)) ** 2) / COUNTS, COUNTS)
+"""Solid angles of the patches times their cosines, from the basis as it is published."""
+
 WHITE = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
 """From linear sRGB to XYZ, by the matrix that the standard gives (IEC 61966-2-1)."""
 
@@ -29,12 +32,6 @@ def matrices(path):
     return found
 
 
-def projected_solid_angles():
-    """Of the patches, from the basis as it is published."""
-    cosines = np.cos(np.radians(BOUNDS)) ** 2
-    return np.repeat(np.pi * (cosines[:-1] - cosines[1:]) / COUNTS, COUNTS)
-
-
 @pytest.fixture(scope="module")
 def sheet_file(tmp_path_factory):
     path = tmp_path_factory.mktemp("klems") / "sheet.xml"
@@ -43,13 +40,13 @@ def sheet_file(tmp_path_factory):
 
 @pytest.mark.slow
 def test_columns_hold_what_the_stack_sends(sheet_file):
-    sheet, projected = matrices(sheet_file), projected_solid_angles()
+    sheet = matrices(sheet_file)
     assert len(sheet) == 4
     for side, above in (("Front", True), ("Back", False)):
         down = lj.direction(0.0 if above else np.pi, 0.0)
         reflected, passed = (float(share[0]) for share in lj.albedo(SHEET, down, TRANSPORT))
         straight = float(lj.unscattered(SHEET, down)[0])
-        sums = {kind: projected @ sheet["Visible", f"{kind} {side}"] for kind in ("Reflection", "Transmission")}
+        sums = {kind: PROJECTED @ sheet["Visible", f"{kind} {side}"] for kind in ("Reflection", "Transmission")}
         # the first patch is 5 degrees wide
         assert sums["Reflection"][0] == pytest.approx(reflected, rel=0.01)
         assert sums["Transmission"][0] == pytest.approx(passed + straight, rel=0.01)
@@ -61,19 +58,17 @@ def test_unscattered_light_stays_in_its_patch(tmp_path):
     assert np.count_nonzero(matrix) == 145
     squares = np.linspace(*np.sin(np.radians([BOUNDS[:-1], BOUNDS[1:]])) ** 2, 20001)  # of sines: even in flux
     passed = np.mean(np.exp(-0.5 / np.sqrt(np.maximum(1.0 - squares, 1e-12))), axis=0)
-    found = np.diag(matrix) * projected_solid_angles()
-    np.testing.assert_allclose(found, np.repeat(passed, COUNTS), rtol=1e-3, atol=1e-4)
+    np.testing.assert_allclose(np.diag(matrix) * PROJECTED, np.repeat(passed, COUNTS), rtol=1e-3, atol=1e-4)
 
 
 def test_panes_mirror_and_pass_light_in_its_own_patch(tmp_path):
-    """A smooth pane has no other light; all of it is there."""
     fits.export(lj.Stack([lj.Interface(1.5), lj.Interface(1.0)]), tmp_path / "pane.xml", "klems")
     found = matrices(tmp_path / "pane.xml")
     shares = []
     for kind, side in itertools.product(("Reflection", "Transmission"), ("Front", "Back")):
         matrix = found["Visible", f"{kind} {side}"]
         assert np.count_nonzero(matrix) == 145
-        shares.append(np.diag(matrix) * projected_solid_angles())
+        shares.append(np.diag(matrix) * PROJECTED)
     np.testing.assert_allclose(shares[0] + shares[2], 1.0, atol=1e-4)
     np.testing.assert_allclose(shares[0], shares[1], atol=1e-4)
     assert shares[0][0] == pytest.approx(0.0769, abs=1e-4)
@@ -109,3 +104,18 @@ def test_what_is_written_is_read_with_axes_that_are_not_turned(sheet_file):
     assert apart((1.0, 1.0, 1.0)) < 0.15
     for mirror in ((-1.0, 1.0, 1.0), (1.0, -1.0, 1.0), (-1.0, -1.0, 1.0), (1.0, 1.0, -1.0), (-1.0, 1.0, -1.0)):
         assert apart(mirror) > 0.3
+
+
+@pytest.mark.peers
+def test_radiance_finds_sides_and_shares(sheet_file):
+    """What its library sums over all that leaves, from patches 10 degrees wide; its z points where the room is."""
+    bsdf = pytest.importorskip("pyradiance").bsdf
+    read, every = bsdf.load_file(str(sheet_file)), bsdf.SAMPLE_ALL
+    for theta in (20.0, 40.0, 140.0, 160.0):
+        for phi in (0.0, 90.0, 200.0, 290.0):
+            t, p = np.radians([theta, phi])
+            wi = np.array([-np.sin(t) * np.cos(p), np.sin(t) * np.sin(p), -np.cos(t)])
+            reflected, passed = (float(share[0]) for share in lj.albedo(SHEET, wi, TRANSPORT))
+            passed += float(lj.unscattered(SHEET, wi)[0])
+            assert bsdf.direct_hemi(read, theta, phi, every & ~bsdf.SAMPLE_T) == pytest.approx(reflected, abs=0.02)
+            assert bsdf.direct_hemi(read, theta, phi, every & ~bsdf.SAMPLE_R) == pytest.approx(passed, abs=0.02)

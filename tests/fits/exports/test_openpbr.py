@@ -21,26 +21,25 @@ evaluate, albedo = eqx.filter_jit(model.evaluate), eqx.filter_jit(model.albedo)
 
 COPPER = lj.Conductor([0.2, 0.9, 1.1], [3.9, 2.4, 2.2], 0.16)
 METAL = {"base_color": (0.91, 0.6, 0.5), "specular_color": (0.86, 0.9, 0.95), "specular_roughness": 0.5}
-COAT = {"coat_ior": 1.4, "coat_roughness": 0.3}
+COAT, GLOSS = {"coat_ior": 1.4, "coat_roughness": 0.3}, {"specular_ior": 1.5, "specular_roughness": 0.4}
+DENSE = {"specular_ior": 1.9, "specular_roughness": 0.5}
 RED = (0.5, 0.3, 0.1)
+PLASTIC = lj.Stack([lj.Interface(1.5, 0.09)], lj.Lambertian(RED))
 
 SURFACES = {
     "metal": (Surface(("metal",), base_metalness=1.0, **METAL), 1e-3),
     # below a lobe MaterialX takes the albedo of Schlick's reflectance, even below one without weight
     "diffuse": (Surface(("diffuse",), (0.8, 0.4, 0.1), 0.7), 0.02),
-    "gloss over black": (Surface(("gloss", "diffuse"), 0.0, specular_ior=1.5, specular_roughness=0.4), 1e-3),
-    "gloss over diffuse": (Surface(("gloss", "diffuse"), RED, specular_ior=1.5, specular_roughness=0.4), 0.02),
+    "gloss over black": (Surface(("gloss", "diffuse"), 0.0, **GLOSS), 1e-3),
+    "gloss over diffuse": (Surface(("gloss", "diffuse"), RED, **GLOSS), 0.02),
     "coat over metal": (Surface(("coat", "metal"), base_metalness=1.0, **METAL, **COAT), 0.02),
-    "coat over gloss over diffuse": (
-        Surface(("coat", "gloss", "diffuse"), RED, specular_ior=1.9, specular_roughness=0.5, **COAT),
-        0.02,
-    ),
+    "coat over gloss over diffuse": (Surface(("coat", "gloss", "diffuse"), RED, **DENSE, **COAT), 0.02),
     "coat over metal and diffuse": (Surface(("coat", "metal", "diffuse"), base_metalness=0.6, **METAL, **COAT), 0.1),
 }
-
-
 SHADERS = json.loads((Path(__file__).parents[2] / "data" / "openpbr_values.json").read_text())
 """Values by MaterialX's own (see `tools.openpbr_values`)."""
+
+ALL = "coat", "metal", "gloss", "diffuse"
 
 
 @pytest.mark.parametrize("name", SURFACES)
@@ -60,9 +59,6 @@ def test_values_are_those_of_materialx(name):
 
 def towards(*degrees):
     return lj.direction(np.radians(degrees), 0.3)
-
-
-ALL = "coat", "metal", "gloss", "diffuse"
 
 
 def test_a_white_surface_loses_no_light():
@@ -107,11 +103,7 @@ def read(path):
     ("stack", "expected", "off"),
     [
         (lj.Stack([], COPPER), {"base_color": ((0.93, 0.63, 0.55), 0.05), "specular_roughness": (0.4, 0.03)}, 5.0),
-        (
-            lj.Stack([lj.Interface(1.5, 0.09)], lj.Lambertian(RED)),
-            {"specular_ior": (1.5, 0.05), "specular_roughness": (0.3, 0.03)},
-            12.0,
-        ),
+        (PLASTIC, {"specular_ior": (1.5, 0.05), "specular_roughness": (0.3, 0.03)}, 12.0),
     ],
     ids=["copper", "plastic"],
 )

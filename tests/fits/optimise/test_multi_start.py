@@ -52,7 +52,6 @@ def test_a_race_ends_where_all_starts_do(monkeypatch):
 
 
 def test_the_lowest_end_is_the_fit_though_it_ran_out_of_steps(monkeypatch):
-    """A few steps, and no further round: none has converged, all are counted, and the lowest is told."""
     monkeypatch.setattr(starts_module, "MOST_STEPS", 4)
     monkeypatch.setattr(starts_module, "MOST_ROUNDS", 1)
     calls = []

@@ -5,12 +5,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy import stats
-from scipy.spatial.transform import Rotation
 
 from fits import Discrepancy, Free, LogNormal, Measurements, Noise, Problem, slices
 from fits.data.measurements import channel_names
 from fits.problem.discrepancy import Correlation, make_process, places
 from fits.problem.model import Model
+from tests.helpers.merl import half_angles
 from tests.helpers.models import along
 
 LAYOUTS = {
@@ -21,16 +21,15 @@ LAYOUTS = {
     "a narrow scan": slices([45.0], 45.0 + np.linspace(-1.0, 1.0, 9)),
 }
 MANY = slices([5.0, 20.0, 35.0, 50.0, 60.0, 70.0], np.linspace(-85.0, 85.0, 100))
+FREE = Free(20.0, 10.0, 50.0)
 
 
 def transport(stack, wi, wo):
-    """A lobe, whose channels differ."""
     half = wi + wo
     return (0.1 + stack["a"] * jnp.exp(-jnp.sum(half[:, :2] ** 2, axis=-1)))[:, None] * jnp.asarray(stack["colour"])
 
 
 def problem(layout: str, channels: int = 1, relative: float | Free = 0.01, **correlated) -> Problem:
-    """A stack of one free number, fitted to noise about it."""
     geometry, stack = LAYOUTS[layout], {"a": Free(0.4, 0.0, 1.0), "colour": np.linspace(1.0, 0.5, channels)}
     exact = np.asarray(transport(stack | {"a": 0.5}, geometry.wi, geometry.wo))
     scatter = np.random.default_rng(len(geometry)).standard_normal(exact.shape)
@@ -46,23 +45,15 @@ def matern(distance: np.ndarray, length: float) -> np.ndarray:
 
 def folded(data: Measurements) -> np.ndarray:
     """Half angle, and difference angle as a vector of |cos| and |sin| of its azimuth, (N, 3), and the side, (N,)."""
-    rows = []
-    for wi, wo in zip(data.wi, data.wo, strict=True):
-        side = 2 if wi[2] * wo[2] <= 0 else int(wi[2] < 0)
-        one, other = (np.array([w[0], w[1], abs(w[2])]) for w in (wi, wo))
-        half = (one + other) / np.linalg.norm(one + other)
-        tilt, azimuth = np.arccos(min(half[2], 1.0)), np.arctan2(half[1], half[0])
-        # Rusinkiewicz 1998: turn the half vector onto the normal, about z and then about y
-        difference = Rotation.from_euler("zy", [-azimuth, -tilt]).apply(one)
-        theta = np.degrees(np.arccos(np.clip(difference[2], -1.0, 1.0)))
-        length = np.hypot(*difference[:2])
-        cosine, sine = np.abs(difference[:2]) / length if length > 1e-9 and tilt > 1e-9 else (1.0, 0.0)
-        rows.append([np.degrees(tilt), theta * cosine, theta * sine, side])
-    return np.array(rows)
+    upper = (np.column_stack([w[:, :2], np.abs(w[:, 2])]) for w in (data.wi, data.wo))
+    tilt, _, theta, azimuth = half_angles(*upper)
+    azimuth[tilt < 1e-7] = 0.0  # about the normal there is none
+    side = np.where(data.wi[:, 2] * data.wo[:, 2] <= 0, 2, data.wi[:, 2] < 0)
+    theta = np.degrees(theta)
+    return np.stack([np.degrees(tilt), theta * np.abs(np.cos(azimuth)), theta * np.abs(np.sin(azimuth)), side], axis=-1)
 
 
 def kernel(one: np.ndarray, other: np.ndarray, at: Correlation) -> np.ndarray:
-    """Of relative errors between places."""
     tilt = matern(np.abs(one[:, None, 0] - other[:, 0]), float(at.length_half))
     apart = np.linalg.norm(one[:, None, 1:3] - other[:, 1:3], axis=-1)
     alike = tilt * matern(apart, float(at.length_difference)) * (one[:, None, 3] == other[:, 3])
@@ -82,7 +73,7 @@ def soft(of: Problem) -> np.ndarray:
 
 
 def dense(of: Problem, vector: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Mean and covariance of all logarithms asinh(x / s), (N C,) and (N C, N C), without inducing points."""
+    """Mean (N C,) and covariance of all logarithms asinh(x / s), without inducing points."""
     at, predicted, own = of.build(vector).correlation, np.asarray(of.predict(vector)), folded(of.data)
     together = float(at.channel_correlation)
     colours = together + (1.0 - together) * np.eye(predicted.shape[1])
@@ -196,10 +187,8 @@ def test_derivatives_at_the_ends(end: str, relative: float | Free) -> None:
 
 def test_what_is_given_is_no_parameter() -> None:
     every = tuple(f"noise.discrepancy.{name}" for name in Correlation._fields)
-    assert problem("one scan").names == ("['a']", *every[:4])
-    assert problem("two planes", 3).names[1:] == every
-    free = Free(20.0, 10.0, 50.0)
-    fixed = problem("two planes", amplitude=0.1, length_half=20.0, length_difference=free, grazing_exponent=0.0)
+    assert (problem("one scan").names, problem("two planes", 3).names[1:]) == (("['a']", *every[:4]), every)
+    fixed = problem("two planes", amplitude=0.1, length_half=20.0, length_difference=FREE, grazing_exponent=0.0)
     assert fixed.units == {"['a']": "1", "noise.discrepancy.length_difference": "deg"}
     own = problem("one scan", amplitude=Free(0.05, 0.01, 0.2, LogNormal(0.05, 0.3)))
     assert (own.low[1], own.high[1]) == (0.01, 0.2)

@@ -1,7 +1,5 @@
 """Free parameters: what is refused, priors against scipy, transforms against calculus, channels that are tied."""
 
-from collections.abc import Callable, Sequence
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -14,6 +12,7 @@ import layerjax as lj
 from fits.problem.parameters import Box, Free, LogNormal, LogUniform, Normal, PowerLaw, Uniform, names_of, split
 from fits.problem.problem import Joint, Problem
 from tests.helpers.models import along
+from tests.helpers.refusals import refuses
 
 PRIORS = {  # within the bounds; the logarithm of a log-normal is normal
     "uniform": (Free(0.5, 0.2, 0.9, Uniform()), stats.uniform(0.2, 0.7).logpdf),
@@ -24,16 +23,18 @@ PRIORS = {  # within the bounds; the logarithm of a log-normal is normal
 }
 LOGARITHM = stats.truncnorm(-2.0, 2.0, np.log(1.1), 0.5).logpdf
 WAVELENGTHS = (450.0, 550.0, 650.0, 750.0)
+GEOMETRY = fits.slices(incidence=(10.0, 50.0), outgoing=np.arange(-70.0, 71.0, 10.0))
+NOISE = fits.Noise(relative=0.02, floor=1e-6, discrepancy=False)
+SINGLE = lj.SingleScattering()
 
 
-def law(**changed) -> PowerLaw:
+def law(**changed):
     given = {"amplitude": Free(4.0, 0.1, 50.0), "exponent": Free(0.0, -4.0, 4.0), "wavelengths": WAVELENGTHS}
     return PowerLaw(**given | changed)
 
 
-@pytest.mark.parametrize(
-    ("call", "message"),
-    [
+def test_refused():
+    for call, message in (
         (lambda: Free(0.5, 1.0, 0.0), "low must be below high"),
         (lambda: Free(2.0, 0.0, 1.0), r"Free.start is 2.0; it must lie in \[0.0, 1.0\]"),
         (lambda: Free("half", 0.0, 1.0), "Free.start is 'half'; it must be a finite number"),
@@ -56,15 +57,12 @@ def law(**changed) -> PowerLaw:
         (lambda: problem(paint(law(), Free((0.5,) * 3, 0.1, 5.0))), r"mu_s has 4, layers\[0\].mu_a has 3"),
         (lambda: problem(paint(law(wavelengths=WAVELENGTHS[:3]))), "stack: it has 3 channels, the data 4"),
         (lambda: joint(walk(0.1), walk(0.2)), "has other bounds or another prior in 'two' than in 'one'"),
-    ],
-)
-def test_refused(call, message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        call()
+    ):
+        refuses(message, call)
 
 
 @pytest.mark.parametrize(("free", "reference"), PRIORS.values(), ids=PRIORS)
-def test_prior_density_is_scipys(free: Free, reference: Callable) -> None:
+def test_prior_density_is_scipys(free, reference):
     """Within the bounds, -inf outside; over the unconstrained vector it integrates to 1 if the determinant is right."""
     box = Box.of([free])
     values = np.linspace(free.low, free.high, 11)[1:-1]
@@ -79,14 +77,14 @@ def test_prior_density_is_scipys(free: Free, reference: Callable) -> None:
 
 @pytest.mark.parametrize("mean", [-0.36, 0.7])
 @pytest.mark.parametrize("sd", [0.01, 0.9e6, 1.1e6, 1e300])
-def test_priors_near_the_limits_are_computed(mean: float, sd: float) -> None:
+def test_priors_near_the_limits_are_computed(mean, sd):
     box = Box.of([Free(0.5, 0.0, 1.0, Normal(mean, sd))])
     density = jax.jit(lambda x: jnp.exp(box.log_prior(x[None])))
     total, _ = integrate.quad(lambda x: float(density(jnp.asarray(x))), 0, 1, points=[0.01, 0.69, 0.71, 0.99])
     assert total == pytest.approx(1.0, abs=1e-9)
 
 
-def test_maps_are_inverses_reach_the_bounds_and_are_finite_far_out() -> None:
+def test_maps_are_inverses_reach_the_bounds_and_are_finite_far_out():
     box = Box.of([Free(0.5, 0.2, 0.9), Free([1.0, 2.0], 0.01, 10.0, LogUniform())])
     for u in np.random.default_rng(1).normal(0, 4, (10, 3)):
         vector = box.constrain(u)
@@ -102,7 +100,7 @@ def test_maps_are_inverses_reach_the_bounds_and_are_finite_far_out() -> None:
         assert all(np.isfinite(part).all() for part in value_and_slope(jnp.full(3, u)))
 
 
-def test_a_stack_is_split_and_filled_by_name() -> None:
+def test_a_stack_is_split_and_filled_by_name():
     albedo = Free([0.1, 0.2, 0.3], 0.0, 1.0)
     medium = lj.Medium(Free(0.5, 0.0, 2.0), 0.7, lj.HenyeyGreenstein(Free(0.1, -0.9, 0.9)))
     template, free = split(lj.Stack([medium], base=lj.Lambertian(albedo=albedo)))
@@ -112,43 +110,35 @@ def test_a_stack_is_split_and_filled_by_name() -> None:
     assert eqx.tree_equal(template.fill(jnp.array([0.4, 0.2, 0.5, 0.6, 0.7])), expected)
 
 
-GEOMETRY = fits.slices(incidence=(10.0, 50.0), outgoing=np.arange(-70.0, 71.0, 10.0))
-NOISE = fits.Noise(relative=0.02, floor=1e-6, discrepancy=False)
-SINGLE = lj.SingleScattering()
-
-
-def paint(mu_s, mu_a=0.5) -> lj.Stack:
+def paint(mu_s, mu_a=0.5):
     return lj.Stack([lj.TurbidMedium(0.2, mu_s, mu_a, lj.HenyeyGreenstein(0.3))], lj.Lambertian(0.2))
 
 
-def problem(stack: lj.Stack) -> Problem:
+def problem(stack):
     return Problem(stack, along(GEOMETRY, channels=[f"{nm:g}" for nm in WAVELENGTHS]), SINGLE, NOISE)
 
 
-def walk(steps: float | None) -> lj.Stack:
+def walk(steps):
     return paint(Free((4.0,) * 4, 0.1, 50.0, LogUniform(), random_walk_sd=steps))
 
 
-def joint(*stacks: lj.Stack, shared: Sequence[str] = ("layers",)) -> Joint:
+def joint(*stacks, shared=("layers",)):
     return Joint(dict(zip(("one", "two"), map(problem, stacks), strict=True)), shared=shared)
 
 
-def test_a_power_law_is_a_number_a_channel() -> None:
+def test_a_power_law_is_a_number_a_channel_about_the_geometric_mean():
     mu_s = 6.0 * (np.array(WAVELENGTHS) / 600.0) ** -1.5
     posed = problem(paint(law(reference=600.0)))
     assert posed.units == {"layers[0].mu_s.amplitude": "1/mm", "layers[0].mu_s.exponent": "1"}
     np.testing.assert_allclose(posed.build([6.0, 1.5]).stack.layers[0].mu_s, mu_s, rtol=1e-12)
     exact = lj.evaluate(paint(mu_s), GEOMETRY.wi, GEOMETRY.wo, SINGLE)
     np.testing.assert_allclose(posed.predict([6.0, 1.5]), exact, rtol=1e-9)
-
-
-def test_the_reference_is_the_geometric_mean() -> None:
     assert law().reference == pytest.approx(stats.gmean(WAVELENGTHS))
     low, high = law(exponent=1.0, amplitude=Free(4.0, 1.0, 9.0), reference=450.0).extremes()
     np.testing.assert_allclose([low, high], np.outer([1.0, 9.0], 450.0 / np.array(WAVELENGTHS)))
 
 
-def test_a_random_walk_has_the_density_of_neighbours_differences() -> None:
+def test_a_random_walk_has_the_density_of_neighbours_differences():
     """Flat priors count once, a Gaussian one makes one Gaussian with it."""
     box = Box.of([Free((1.0, 2.0, 3.0), 0.0, 10.0, random_walk_sd=(0.5, 0.2))])
     expected = -np.log(10.0) + stats.norm.logpdf(0.3, scale=0.5) + stats.norm.logpdf(-0.1, scale=0.2)
@@ -163,9 +153,6 @@ def test_a_random_walk_has_the_density_of_neighbours_differences() -> None:
         box = Box.of([Free((2.0, 2.0, 2.0), 1e-6, 1e3, prior, random_walk_sd=0.1)])
         expected = stats.multivariate_normal([mean] * 3, covariance).logpdf(natural) - jacobian
         assert float(box.log_prior(x)) == pytest.approx(expected)
-
-
-def test_shared_channels_are_smooth_once_in_a_joint_fit() -> None:
-    one = walk(0.1)
+    one = walk(0.1)  # shared channels are smooth once
     np.testing.assert_allclose(joint(one, one).model.box.differences, problem(one).model.box.differences)
     assert joint(one, one, shared=[]).model.box.differences.shape == (6, 8)

@@ -1,22 +1,29 @@
-"""Problems as they are put together: the likelihood against scipy.stats, its least-squares form, what is refused; and
-simulated data: the right values, with noise of the size that is stated."""
+"""Problems: the likelihood against scipy.stats, as least squares, refusals; simulated values; the programs they run."""
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
+from pathlib import Path
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.linalg  # noqa: F401 (what JAX's matrices are solved by)
+from jax.experimental import io_callback
 from scipy import integrate, stats
+from threadpoolctl import threadpool_info, threadpool_limits
 
 import layerjax as lj
 from fits import Discrepancy, Free, Instrument, LogNormal, LogUniform, Noise, Normal, Problem, simulate, slices
 from fits.optimise.options import options_from
+from fits.problem import compilation
+from fits.problem.compilation import Static, one_thread, run
 from fits.problem.model import Model
 from fits.problem.noise import information_weights, log_density, named_residual, tail_residual
 from tests.helpers.models import design, line, measured
+from tests.helpers.refusals import refuses
 
 COUNT = 40
 VALUES = np.random.default_rng(0).normal(0.5, 0.2, (COUNT, 1))
@@ -26,6 +33,22 @@ NU = jnp.asarray(4.0)
 TAILS = {"gaussian": stats.norm, "student": stats.t(4.0)}
 PAINT = lj.Stack([], lj.Lambertian(Free(0.4, 0.0, 1.0)))
 DATA = simulate(lj.Stack([], lj.Lambertian(0.6)), slices(incidence=[20], outgoing=[-40, 10, 70]), noise=0.1)
+ALBEDO = np.array([0.2, 0.4, 0.6])
+COLOURS = lj.Stack([], lj.Lambertian(ALBEDO))
+NOISES = {
+    "sigma": Noise(),
+    "sigma and relative": Noise(relative=0.1, floor=0.02),
+    "relative": Noise(relative=0.1, floor=0.02, use_sigma=False),
+    "free": Noise(relative=Free(0.1, 0.0, 1.0), floor=Free(0.02, 1e-3, 1.0), use_sigma=False),
+    "free student": Noise(relative=0.05, floor=Free(0.02, 1e-3, 1.0), tails="student", degrees_of_freedom=3.0),
+}
+WALK = lj.Stack([], lj.Lambertian(Free((0.4, 0.4), 0.0, 1.0, random_walk_sd=0.1)))
+TWO = replace(DATA, values=np.repeat(DATA.values, 2, axis=1), sigma=None, channels=("a", "b"))
+MANY = np.array([0.1, 0.2, 0.3])
+BARE = lj.Stack([], lj.Lambertian(0.5))
+MIXED = lj.Mixture(dict.fromkeys("abc", BARE), [Free(0.2, 0.0, 0.7), Free(0.2, 0.0, 0.5), None])
+FLOOR, FLAT = Instrument(floor=1e-3), {"a": Free(0.3, 0.01, 2.0), "b": 0.1}
+LINE_DATA, DARK = measured(VALUES), measured(1e-300 * np.ones_like(VALUES))
 
 
 @pytest.mark.parametrize("z", [0.0, 1e-12, -1e-5, 0.019, 0.0201, -0.3, 2.0, 40.0, 1e6])
@@ -42,26 +65,11 @@ def test_densities_are_scipys_and_half_squares_of_residuals(z: float) -> None:
 @pytest.mark.parametrize("tails", TAILS)
 def test_information_is_the_mean_square_score(tails: str) -> None:
     reference, step = TAILS[tails], 1e-5
-
-    def mean(z: np.ndarray) -> np.ndarray:
-        return (reference.logpdf(z - step) - reference.logpdf(z + step)) / (2 * step)
-
-    def level(z: np.ndarray) -> np.ndarray:
-        ends = [reference.logpdf(z * np.exp(-t)) - t for t in (step, -step)]
-        return (ends[0] - ends[1]) / (2 * step)
-
     z = np.concatenate([np.linspace(0.0, 10.0, 4001), np.geomspace(10.0, 400.0, 4001)[1:]])
-    expected = [2.0 * integrate.simpson(reference.pdf(z) * score(z) ** 2, z) for score in (mean, level)]
+    mean = (reference.logpdf(z - step) - reference.logpdf(z + step)) / (2 * step)
+    level = (reference.logpdf(z * np.exp(-step)) - reference.logpdf(z * np.exp(step))) / (2 * step) - 1.0
+    expected = [2.0 * integrate.simpson(reference.pdf(z) * score**2, z) for score in (mean, level)]
     np.testing.assert_allclose(information_weights(tails, NU), expected, rtol=1e-4)
-
-
-NOISES = {
-    "sigma": Noise(),
-    "sigma and relative": Noise(relative=0.1, floor=0.02),
-    "relative": Noise(relative=0.1, floor=0.02, use_sigma=False),
-    "free": Noise(relative=Free(0.1, 0.0, 1.0), floor=Free(0.02, 1e-3, 1.0), use_sigma=False),
-    "free student": Noise(relative=0.05, floor=Free(0.02, 1e-3, 1.0), tails="student", degrees_of_freedom=3.0),
-}
 
 
 @pytest.mark.parametrize("noise", NOISES.values(), ids=NOISES)
@@ -167,11 +175,7 @@ def test_what_follows_from_a_problem() -> None:
     np.testing.assert_allclose(three.predict([0.1, 0.2, 0.3])[0], np.array([0.1, 0.2, 0.3]) / np.pi, rtol=1e-12)
 
 
-ALBEDO = np.array([0.2, 0.4, 0.6])
-COLOURS = lj.Stack([], lj.Lambertian(ALBEDO))
-
-
-def test_simulated_values_and_noise_are_as_stated():
+def test_simulated_values_and_noise_are_as_stated_seeds_repeat_and_samples_without_light_are_masked():
     plain = simulate(COLOURS, slices(incidence=[20, 60]))
     np.testing.assert_allclose(plain.values, np.broadcast_to(ALBEDO / np.pi, plain.values.shape), rtol=1e-12)
     assert plain.sigma is None
@@ -182,23 +186,11 @@ def test_simulated_values_and_noise_are_as_stated():
     np.testing.assert_allclose(data.sigma, np.broadcast_to(expected, data.sigma.shape))
     z = (data.values - ALBEDO / np.pi) / data.sigma
     assert stats.kstest(z.ravel(), "norm").pvalue > 1e-3  # a fixed seed: passes or fails for good
-
-
-def test_seeds_repeat_and_samples_without_light_are_masked():
     first, again, other = (simulate(COLOURS, slices(), noise=0.1, seed=seed).values for seed in (1, 1, 2))
     np.testing.assert_array_equal(first, again)
     assert (first != other).all()
     data = simulate(COLOURS, slices(incidence=[30], outgoing=[10, 120]), noise=0.05)
     np.testing.assert_array_equal(data.mask, [True, False])  # nothing passes an opaque base
-
-
-WALK = lj.Stack([], lj.Lambertian(Free((0.4, 0.4), 0.0, 1.0, random_walk_sd=0.1)))
-TWO = replace(DATA, values=np.repeat(DATA.values, 2, axis=1), sigma=None, channels=("a", "b"))
-MANY = np.array([0.1, 0.2, 0.3])
-BARE = lj.Stack([], lj.Lambertian(0.5))
-MIXED = lj.Mixture(dict.fromkeys("abc", BARE), [Free(0.2, 0.0, 0.7), Free(0.2, 0.0, 0.5), None])
-FLAT = {"a": Free(0.3, 0.01, 2.0), "b": 0.1}
-LINE_DATA, DARK = measured(VALUES), measured(1e-300 * np.ones_like(VALUES))
 
 
 def named(noise: Noise) -> Problem:
@@ -209,9 +201,8 @@ def rough(roughness: Free | np.ndarray) -> lj.Stack:
     return lj.Stack([], lj.OrenNayar(0.4, roughness))
 
 
-@pytest.mark.parametrize(
-    ("call", "message"),
-    [
+def test_refused() -> None:
+    for call, message in (
         (lambda: Noise(floor=Free(0.1, 0.0, 1.0)), r"Noise.floor.low is 0.0; it must be a number in \[1e-100, "),
         (lambda: Noise(relative=Free([0.1, 0.1], 0.0, 1.0)), "Noise.relative has 2 channels"),
         (lambda: Noise(floor=1e-200), r"Noise.floor is 1e-200; it must be a number in \[1e-100, 1e\+100\]"),
@@ -224,8 +215,8 @@ def rough(roughness: Free | np.ndarray) -> lj.Stack:
         (lambda: Instrument(gain_sd=True), "Instrument.gain_sd is True"),
         (lambda: options_from({"tolerance": 1.0}), r"\[options\] has an unknown key 'tolerance'; allowed: same_v"),
         (
-            lambda: Problem(STACK, LINE_DATA, line, Noise(floor=1e-4), instrument=Instrument(floor=1e-3)),
-            r"Noise.floor and Instrument.floor are both given",
+            lambda: Problem(STACK, LINE_DATA, line, Noise(floor=1e-4), instrument=FLOOR),
+            "Noise.floor and Instrument.floor",
         ),
         (lambda: Problem(MIXED, DATA), r"Mixture.weights: at their upper bounds they sum to 1.2; it must be at most"),
         (lambda: Problem(PAINT, DATA, lj.RandomWalk()), "RandomWalk is random; use a deterministic one"),
@@ -244,13 +235,51 @@ def rough(roughness: Free | np.ndarray) -> lj.Stack:
         (lambda: named(Noise(discrepancy=True)), r"noise\.discrepancy: objective 'cube_root' weighs neither"),
         (lambda: Problem(WALK, replace(TWO, values=TWO.values[:, :1], channels=("a",))), "it has 2 channels, the data"),
         (lambda: Problem(PAINT, DATA, transport="walk"), r'transport: .* is not a Transport or "auto"'),
-        (
-            lambda: Problem(rough(Free(MANY, 0.0, 1.0)), DATA),
-            r"takes one stack; base.roughness of shape \(3,\) makes it",
-        ),
+        (lambda: Problem(rough(Free(MANY, 0.0, 1.0)), DATA), r"takes one stack; base.roughness of shape \(3,\) makes"),
         (lambda: simulate(rough(MANY), slices()), r"base.roughness of shape \(3,\)"),
-    ],
-)
-def test_refused(call, message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        call()
+    ):
+        refuses(message, call)
+
+
+def threads() -> set[int]:
+    """Of the libraries by which matrices are solved."""
+    return {one["num_threads"] for one in threadpool_info() if one["user_api"] == "blas"}
+
+
+def most(model: tuple[()]) -> jax.Array:
+    return io_callback(lambda: np.int32(max(threads())), jax.ShapeDtypeStruct((), jnp.int32))
+
+
+def test_matrices_are_solved_by_one_thread_and_the_others_come_back_after_the_last_call() -> None:
+    arrays, static = eqx.partition((), eqx.is_array)
+    with threadpool_limits(2), ThreadPoolExecutor(2) as pool:
+        program = (arrays, Static(static))
+        assert int(run(most, program)) == 1
+        assert [int(seen) for seen in pool.map(lambda _: run(most, program), range(4))] == [1] * 4
+        assert threads() == {2}
+    first, second = one_thread(), one_thread()
+    with threadpool_limits(2):
+        first.__enter__()
+        second.__enter__()
+        first.__exit__(None, None, None)
+        assert threads() == {1}
+        second.__exit__(None, None, None)
+        assert threads() == {2}
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not Path("/proc/self/maps").exists(), reason="counts maps")
+@pytest.mark.parametrize(("full", "traced"), [(0.0, 2), (1.0, 1)])
+def test_programs_go_where_a_process_has_no_room_for_more(monkeypatch, full: float, traced: int) -> None:
+    monkeypatch.setattr(compilation, "FULL", full)
+    seen = []
+
+    @jax.jit
+    def program(x):
+        seen.append(x)
+        return 2.0 * x
+
+    program(1.0)
+    compilation.make_room()
+    program(1.0)
+    assert len(seen) == traced

@@ -1,17 +1,19 @@
 """TOML problem files: both ways, and whatever they hold: it can be computed with, or one line names file and place."""
 
-from pathlib import Path
-
+import equinox as eqx
 import jax
 import numpy as np
 import pytest
 
+import fits
 import layerjax as lj
 from fits import Discrepancy, Instrument, Noise
 from fits.optimise.options import FitOptions, options_from
 from fits.problem.parameters import Box, Free, LogNormal, LogUniform, Normal, PowerLaw, is_free
 from fits.problem.stack_file import material_to_dict, read_instrument, read_problem, stack_from_dict, write_problem
+from fits.reports.html import FitReport
 from tests.helpers import places
+from tests.helpers.refusals import refuses
 
 EXAMPLES = sorted(places.EXAMPLES.glob("*.toml"))
 FULL = """
@@ -43,24 +45,34 @@ floor = 1e-4
 use_sigma = false
 discrepancy = { length_half = { start = 12.0, low = 8.0, high = 20.0 } }
 """
+MIXED = """\
+transport = "SingleScattering"
+
+[mixture.dust]
+weight = { start = 0.5, low = 0.0, high = 1.0 }
+layers = [{ kind = "Medium", thickness = { start = 1.0, low = 0.1, high = 5.0 }, albedo = 0.6 }]
+base = { kind = "Lambertian", albedo = 0.1 }
+
+[mixture.metal.base]
+kind = "Conductor"
+ior = 0.2
+k = 3.0
+alpha = { start = 0.4, low = 0.1, high = 1.0 }
+"""
+MIXTURE = {"dust.layers[0].thickness": 0.6, "metal.base.alpha": 0.25, "weights.dust": 0.3}
+WEIGHT, METAL = "weight = { start = 0.5, low = 0.0, high = 1.0 }", "[mixture.metal.base]"
 INSTRUMENT = Instrument(detector_aperture=2.0, tilt=Free(0.0, -1.0, 1.0))
 BASE = 'base = { kind = "Lambertian", albedo = 0.5 }\n'
 LAYER = "[[layers]]\nkind = 'Medium'\n"
 THIN = LAYER + "thickness = 1\n"
 TINTED = "base = {{ kind = 'Conductor', ior = 1, k = 1, alpha = 1, film = {} }}\n"
+LAW = PowerLaw(Free(4.0, 0.1, 50.0), Free(0.0, -4.0, 4.0), (450.0, 550.0), 600.0)
 
 
-def read(tmp_path: Path, text: str | bytes):
+def read(tmp_path, text):
     path = tmp_path / "problem.toml"
     path.write_bytes(text if isinstance(text, bytes) else text.encode())
     return read_problem(path)
-
-
-def assert_same(first: lj.Stack, second: lj.Stack) -> None:
-    def same(leaf, other):
-        return leaf == other if is_free(leaf) else np.array_equal(leaf, other)
-
-    assert all(jax.tree.leaves(jax.tree.map(same, first, second, is_leaf=is_free)))
 
 
 def test_everything_in_a_file_arrives_and_is_written_again(tmp_path):
@@ -76,8 +88,7 @@ def test_everything_in_a_file_arrives_and_is_written_again(tmp_path):
     assert problem.scale == Free(1.0, 0.8, 1.25, LogNormal(1.0, 0.05))
     assert problem.transport == lj.AddingDoubling(nodes=16, ordinates=(8, 12), tolerance=0.01)
     assert (problem.objective, problem.instrument) == ("cube_root", INSTRUMENT)
-    assert problem.about == {"source": "a paper", "remark": "kept as it is"}
-    assert problem.text == FULL
+    assert (problem.about, problem.text) == ({"source": "a paper", "remark": "kept as it is"}, FULL)
     assert options_from(problem.options) == FitOptions(autocorrelation=0.4)
 
     path = tmp_path / "again.toml"
@@ -85,16 +96,14 @@ def test_everything_in_a_file_arrives_and_is_written_again(tmp_path):
     settings = {name: getattr(problem, name) for name in names}
     write_problem(path, problem.stack, **settings)
     again = read_problem(path)
-    assert_same(again.stack, problem.stack)
+    assert eqx.tree_equal(again.stack, problem.stack)
     assert {name: getattr(again, name) for name in names} == settings
     assert read_instrument(path) == INSTRUMENT
-    with pytest.raises(ValueError, match="exists already"):
-        write_problem(path, problem.stack)
+    refuses("exists already", write_problem, path, problem.stack)
     write_problem(path, problem.stack, force=True)
     plain = read_problem(path)
     assert (plain.transport, plain.objective, plain.scale, plain.noise) == ("auto", "likelihood", None, Noise())
-    with pytest.raises(ValueError, match=r"again.toml: there is no .instrument."):
-        read_instrument(path)
+    refuses(r"again.toml: there is no .instrument.", read_instrument, path)
 
     for given in (True, False, Discrepancy(0.05)):
         write_problem(path, problem.stack, noise=Noise(0.03, discrepancy=given), force=True)
@@ -111,9 +120,6 @@ def test_what_could_not_be_read_back_is_not_written(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-LAW = PowerLaw(Free(4.0, 0.1, 50.0), Free(0.0, -4.0, 4.0), (450.0, 550.0), 600.0)
-
-
 def test_dictionary_round_trip():
     for stack in (
         lj.Stack([], lj.Conductor([0.2, 0.9], 3.9, 0.1, film=lj.ThinFilm(1.5, Free(9.0, 0.0, 99.0), [610.0, 550.0]))),
@@ -124,7 +130,7 @@ def test_dictionary_round_trip():
         lj.Stack([lj.Interface(1.5, film=lj.ThinFilm(1.38, Free(99.0, 0.0, 200.0), [610.0, 550.0]))]),
         lj.Stack([lj.TurbidMedium(0.2, LAW, 0.5, lj.HenyeyGreenstein(0.3))]),
     ):
-        assert_same(stack_from_dict(material_to_dict(stack)), stack)
+        assert eqx.tree_equal(stack_from_dict(material_to_dict(stack)), stack)
     stack = jax.tree.map(lambda leaf: leaf.astype("float32"), lj.Stack([], base=lj.Lambertian(albedo=np.float32(0.9))))
     assert material_to_dict(stack) == {"base": {"kind": "Lambertian", "albedo": 0.9}}
     assert material_to_dict(lj.Stack([lj.Interface(1.5)])) == {
@@ -162,17 +168,44 @@ WRONG = {
     BASE + "instrument = { detector_aperture = 31 }\n": r"instrument.detector_aperture is 31; .* in \[0, 30\]",
     BASE + "transport = 'Singlescattering'\n": "transport is 'Singlescattering' .did you mean 'SingleScattering'",
     BASE.replace("0.5", "[0.1, 0.2]") + LAYER + "thickness = [1, 2, 3]\n": "disagree on the number of",
+    MIXED.replace("high = 1.0 }\nlayers", "high = 1.2 }\nlayers"): r"weight.high is 1.2, must be a number in \[0, 1\]",
+    MIXED.replace("weight = {", "weight = 0.3\nwait = {"): r"unknown key 'wait' \(did you mean 'weight'\?\)",
+    MIXED.replace("albedo = 0.1", "albedo = 1.1"): r"mixture.dust.base: Lambertian.albedo: 1.1 is outside \[0, 1\]",
+    MIXED.replace(METAL, f"[mixture.metal]\nweight = 0.2\n{METAL}"): "one has to be free of choice",
+    MIXED.replace(METAL, "[base]"): "mixture is a whole material, must stand without base",
+    MIXED.replace(WEIGHT, ""): "mixture: Mixture.weights: 2 are None",
+    MIXED.replace(WEIGHT, "weight = [0.1, 0.2]"): r"dust.weight is \[0.1, 0.2\]; it must be a number in \[0, 1\]",
 }
 
 
 @pytest.mark.parametrize("text", WRONG)
 def test_bad_files_are_one_line_that_names_the_place(tmp_path, text):
-    with pytest.raises(ValueError, match=WRONG[text]) as caught:
-        read(tmp_path, text)
-    assert str(caught.value).startswith(str(tmp_path / "problem.toml"))
-    assert "\n" not in str(caught.value)
-    with pytest.raises(ValueError, match="is a directory, must be a file"):
-        read_problem(tmp_path)
+    words = refuses(WRONG[text], read, tmp_path, text)
+    assert words.startswith(str(tmp_path / "problem.toml"))
+    assert "\n" not in words
+    refuses("is a directory, must be a file", read_problem, tmp_path)
+
+
+def test_mixtures_are_read_fitted_and_written(tmp_path):
+    view, single = fits.slices([10.0, 50.0], np.arange(-75.0, 76.0, 7.5)), lj.SingleScattering()
+    thickness, alpha, weight = MIXTURE.values()
+    dust = lj.Stack([lj.Medium(thickness, 0.6)], lj.Lambertian(0.1))
+    mixed = lj.Mixture({"dust": dust, "metal": lj.Stack([], lj.Conductor(0.2, 3.0, alpha))}, [weight, None])
+    data = fits.simulate(mixed, view, single, 0.03, 1e-4)
+    (tmp_path / "dusty.toml").write_text(MIXED)
+    given = read_problem(tmp_path / "dusty.toml")
+    write_problem(tmp_path / "again.toml", given.stack, transport=given.transport)
+    again = read_problem(tmp_path / "again.toml")
+    one, other = (fits.Problem(each.stack, data, each.transport) for each in (given, again))
+    assert one.names == other.names == tuple(MIXTURE)
+    np.testing.assert_array_equal([one.start, one.low], [other.start, other.low])
+    np.testing.assert_allclose(one.predict(one.start), other.predict(other.start))
+    found = fits.fit(given.stack, data, transport=single, starts=1)
+    for name, truth in MIXTURE.items():
+        assert abs(found.values[name] - truth) < 4.0 * found.standard_errors[name]
+    fits.save_fit(found, tmp_path / "result")
+    assert tuple(fits.load_fit(tmp_path / "result").values) == tuple(MIXTURE)
+    assert "[mixture.dust]" in FitReport(found).page()
 
 
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
@@ -215,7 +248,7 @@ VALUES = {token: token for token in TOKENS} | {
 
 
 @pytest.mark.parametrize("name", VALUES)
-def test_any_value_in_any_place(tmp_path: Path, name: str) -> None:
+def test_any_value_in_any_place(tmp_path, name):
     path = tmp_path / "stack.toml"
     for place, text in PLACES.items():
         path.write_text(text.replace("@", VALUES[name]))
