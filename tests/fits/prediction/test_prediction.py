@@ -11,6 +11,7 @@ from fits.data.scans import select
 from fits.prediction.predict import LEVELS
 from fits.reports.tables import UNRELIABLE, scores_table
 from tests.helpers.models import COUNT, POSITIVE_LINE, along, design, directions, line, measured, wrong_line
+from tests.helpers.refusals import refuses
 
 SIGMA = 0.02
 
@@ -70,8 +71,7 @@ def test_quantiles_are_those_of_the_draws_and_hold_what_they_say() -> None:
 
 def test_directions_below_an_opaque_stack_are_refused(coat_fit: Fit) -> None:
     for at in (slices([95.0]), slices([90.0]), slices([30.0], [10.0, 120.0])):
-        with pytest.raises(ValueError, match=r"sees nothing of an opaque stack; its polar angle must be in \[0, 90\)"):
-            predict(coat_fit, at)
+        refuses(r"sees nothing of an opaque stack; its polar angle must be in \[0, 90\)", predict, coat_fit, at)
     assert np.all(predict(coat_fit, slices([89.9]), draws=8).mean > 0.0)
 
 
@@ -96,8 +96,7 @@ def test_bad_requests_are_refused(result: Fit) -> None:
         (lambda: predict(named, data), "a fit of 'cube_root' has no noise model"),
         (lambda: predict(result, along(data, channels="rgb")), "measurements have the channels r, g, b, the fit c0"),
     ):
-        with pytest.raises(ValueError, match=message):
-            call()
+        refuses(message, call)
 
 
 @pytest.mark.parametrize("sigma", [0.02, 0.001])

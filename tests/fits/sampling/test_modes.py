@@ -1,29 +1,35 @@
-"""Posteriors with two modes, whose moments, shares and evidence are known by sums over a grid."""
+"""Posteriors that no Gaussian describes: of two modes, known by sums over a grid, and along a ridge, by integration."""
 
 import math
-from pathlib import Path
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy import special, stats
 
 import fits
-from fits import Fit, Free, Normal, Posterior, SamplerOptions, Uniform, fit, sample
-from fits.problem.parameters import Prior
+import layerjax as lj
+from fits import Free, LogUniform, Normal, Posterior, SamplerOptions, Uniform, fit, sample
 from fits.reports import verdicts
 from fits.reports.tables import parameter_table, posterior_table
+from fits.sampling import importance
 from fits.sampling.convergence import Convergence
-from fits.sampling.importance import importance_draws
+from fits.sampling.importance import components_at, importance_draws
 from fits.sampling.initial import initial_mixture
-from fits.sampling.sample import Sampler, load
-from tests.helpers.models import COUNT, design, measured
+from fits.sampling.sample import load
+from tests.helpers.models import COUNT, design, directions, measured
 
 SIGMA, HIGH = 0.01, 3.0
 COSINE = design(COUNT)[:, 1:]
 EXACT = np.exp(-0.3 / COSINE) + np.exp(-1.5 / COSINE)
 DATA = measured(EXACT + SIGMA * np.random.default_rng(0).standard_normal(EXACT.shape), SIGMA)
 NARROW = 0.8  # of a normal prior on the first of two numbers, which makes one mode likelier
+FEW, SPREAD, LEVEL = 40, 0.005, 0.5
+SCALE = Free(1.0, 0.1, 10.0, LogUniform())
+ALBEDO = Free(0.5, 0.0, 1.0)
+PAINT = lj.Stack([], lj.Lambertian(ALBEDO))
+HAZE = lj.Stack([lj.Medium(Free(0.2, 0.0, 2.0), 0.8)], lj.Lambertian(ALBEDO))
 
 
 def pair(stack, wi, wo):
@@ -31,17 +37,17 @@ def pair(stack, wi, wo):
     return jnp.exp(-stack["p"] / wo[:, 2:]) + jnp.exp(-stack["q"] / wo[:, 2:])
 
 
-def pair_fit(prior: Prior) -> Fit:
+def pair_fit(prior):
     return fit({"p": Free(0.5, 0.0, HIGH, prior), "q": Free(0.6, 0.0, HIGH)}, DATA, transport=pair, starts=8)
 
 
 @pytest.fixture(scope="module", params=["alike", "with a prior"])
-def fitted(request: pytest.FixtureRequest) -> Fit:
+def fitted(request):
     return pair_fit(Uniform() if request.param == "alike" else Normal(0.3, NARROW))
 
 
 @pytest.fixture(scope="module")
-def summed(fitted: Fit) -> tuple[float, ...]:
+def summed(fitted):
     """By a fine grid: mean and deviation of p, the share of the mode where it is the larger, and the log-evidence."""
     x = np.linspace(0.0, HIGH, 3001)
     near = [x[np.abs(x - centre) < 0.1] for centre in (0.3, 1.5)]
@@ -62,7 +68,7 @@ def summed(fitted: Fit) -> tuple[float, ...]:
     return mean, math.sqrt(square - mean**2), float(weights[1].sum() / total), log_evidence
 
 
-def test_evidence_and_draws_by_weight_are_those_of_all_modes(fitted: Fit, summed: tuple) -> None:
+def test_evidence_and_draws_by_weight_are_those_of_all_modes(fitted, summed):
     *_, share, log_evidence = summed
     found = fits.evidence(fitted)
     assert found.reliable
@@ -74,9 +80,7 @@ def test_evidence_and_draws_by_weight_are_those_of_all_modes(fitted: Fit, summed
 
 
 @pytest.mark.parametrize("sampler", ["emcee", pytest.param("nuts", marks=pytest.mark.slow)])
-def test_chains_visit_all_modes_as_often_as_they_are_likely(
-    fitted: Fit, summed: tuple, sampler: Sampler, tmp_path: Path
-) -> None:
+def test_chains_visit_all_modes_as_often_as_they_are_likely(fitted, summed, sampler, tmp_path):
     if sampler == "nuts":
         pytest.importorskip("blackjax")
     mean, deviation, share, _ = summed
@@ -95,7 +99,7 @@ def test_chains_visit_all_modes_as_often_as_they_are_likely(
     assert load(fitted, tmp_path / "chain").modes == posterior.modes
 
 
-def test_both_minima_are_reported_and_whose_errors_are_given(fitted: Fit) -> None:
+def test_both_minima_are_reported_and_whose_errors_are_given(fitted):
     (other,) = fitted.alternatives
     apart = 1e-4 if isinstance(fitted.problem.stack["p"].prior, Uniform) else 0.05
     assert list(other.values.values()) == pytest.approx(list(fitted.values.values())[::-1], rel=apart)
@@ -106,13 +110,13 @@ def test_both_minima_are_reported_and_whose_errors_are_given(fitted: Fit) -> Non
     assert "errors are conditional on this local minimum" in fitted.status
 
 
-def test_minima_that_hold_next_to_nothing_are_no_modes() -> None:
+def test_minima_that_hold_next_to_nothing_are_no_modes():
     found = pair_fit(Normal(0.3, 0.25))  # the other is 11 lower in the log-posterior
     assert len(found.minima) >= 2
     assert initial_mixture(found, 8).mode_count == 1
 
 
-def test_walkers_that_stay_where_they_are_have_not_converged() -> None:
+def test_walkers_that_stay_where_they_are_have_not_converged():
     """Two modes, a walker in each or changing at every step: autocorrelation within walkers is no difference."""
     generator, options = np.random.default_rng(0), SamplerOptions()
     for stays in (True, False):
@@ -124,7 +128,7 @@ def test_walkers_that_stay_where_they_are_have_not_converged() -> None:
         assert found.is_finished(options) == (not stays)
 
 
-def test_it_is_said_where_shares_of_modes_are_not_known(fitted: Fit) -> None:
+def test_it_is_said_where_shares_of_modes_are_not_known(fitted):
     generator = np.random.default_rng(1)
     at = np.array([[0.3, 1.5], [1.5, 0.3]])[np.arange(8) % 2]
     values = at + 0.003 * generator.standard_normal((200, 8, 2))
@@ -135,3 +139,53 @@ def test_it_is_said_where_shares_of_modes_are_not_known(fitted: Fit) -> None:
     assert "R-hat of at most 1.01 are needed" in words
     with pytest.raises(ValueError, match=r"with R-hat of at most 1.01 \(it is [1-9]"):
         posterior.summary()
+
+
+def paint(seed):
+    noise = np.random.default_rng(seed).standard_normal((FEW, 1))
+    return measured(LEVEL / np.pi * (1.0 + 0.01 * noise), SPREAD)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(6))
+def test_haze_and_albedo_times_scale(seed):
+    """By integration over thickness and albedo, with the scale integrated as the Gaussian that it nearly is."""
+    fitted = fit(HAZE, paint(seed), scale=SCALE, transport=lj.SingleScattering(), starts=8, seed=seed)
+    posterior = sample(fitted, seed=seed, max_steps=5000)
+    assert posterior.converged
+    thickness, albedo = 0.08 * (np.arange(400) + 0.5) / 400, (np.arange(200) + 0.5) / 200
+    wi, wo, values = directions(FEW, 1), directions(FEW, 2), paint(seed).values[:, 0]
+
+    @jax.jit
+    def model(t, a):
+        return lj.evaluate(lj.Stack([lj.Medium(t, 0.8)], lj.Lambertian(a)), wi, wo, lj.SingleScattering())[:, 0]
+
+    f = np.asarray(jax.vmap(lambda t: jax.vmap(lambda a: model(t, a))(jnp.asarray(albedo)))(jnp.asarray(thickness)))
+    square, product = np.sum(f * f, axis=-1), f @ values
+    scale = product / square
+    ends = np.array([0.1, 10.0])[:, None, None]
+    within = np.diff(stats.norm.cdf((ends - scale) * np.sqrt(square) / SPREAD), axis=0)[0]
+    misfit = np.sum((values - scale[..., None] * f) ** 2, axis=-1) / SPREAD**2
+    density = np.exp(-0.5 * (misfit - misfit.min())) / (scale * np.sqrt(square)) * within
+    shares, error = [0.1, 0.3, 0.5, 0.7, 0.9], 1.0 / np.sqrt(posterior.effective_samples.min())
+    for axis, name, grid in ((0, "base.albedo", albedo), (1, "layers[0].thickness", thickness)):
+        below = np.cumsum(density.sum(axis=axis))
+        levels = np.interp(shares, below / below[-1], grid + 0.5 * (grid[1] - grid[0]))
+        values = posterior.chain[posterior.burn_in :, :, posterior.names.index(name)].ravel()
+        # the product is known to half a per cent
+        np.testing.assert_allclose(np.mean(values[:, None] < levels, axis=0), shares, atol=2.0 * error + 0.005)
+
+
+def test_a_mixture_grows_from_any_draws():
+    """From two draws, and where the information has no finite values: the spread of the draws takes its place."""
+    fitted = fit(PAINT, paint(0), scale=SCALE, transport=lj.SingleScattering(), starts=2)
+    draws = importance_draws(fitted, 2, np.random.RandomState(0))
+    assert draws.effective_sample_size > 300
+    where = draws.mixture.centre[-3:]
+    assert np.isfinite(components_at(fitted.problem, where, np.zeros((2, 2))).log_density(where)).all()
+    with pytest.MonkeyPatch.context() as patch:
+        rows = np.full((FEW, 2), np.nan)
+        patch.setattr(importance, "local_information", lambda problem, unit: (rows, np.full(2, np.inf), 0.0))
+        blind = components_at(fitted.problem, where, np.diag([1.0, 4.0]))
+    assert np.isfinite(blind.log_density(where)).all()
+    assert np.all(blind.root @ np.swapaxes(blind.root, 1, 2) <= 4.0 * np.diag([1.0, 4.0]) + 1e-12)
