@@ -3,11 +3,10 @@
     python -m tests.fits.record write [CASE ...]      # computes the cases (all by default) and keeps them
     python -m tests.fits.record check [CASE ...]      # computes them again, and prints and counts what differs
 
-The numbers stand in `tests/data/record.json`. Costs agree to 1e-6 of themselves, values to 0.01 standard errors,
-standard errors to 1e-3, elpd differences to a hundredth of their error, quantiles to 0.1 sd. A chi-square follows the
-noise levels of the optimum to first order: moved by 0.01 standard errors, it changes by 0.014 of its own standard
-deviation, a thousandth with 200 degrees of freedom. Predictions are means of 256 draws: four standard errors of the
-difference of two are 0.35 sd. Every case takes from seconds to minutes, which is why no test runs them.
+The numbers stand in `tests/data/record.json`, how far they may differ in `LIMITS`. A chi-square follows the noise of
+the optimum to first order: moved by 0.01 standard errors, it changes by 0.014 of its own standard deviation, a
+thousandth with 200 degrees of freedom. Predictions are means of 256 draws: four standard errors of the difference of
+two are 0.35 sd. Every case takes from seconds to minutes, which is why no test runs them.
 """
 
 import json
@@ -33,7 +32,6 @@ GEOMETRY = fits.slices(incidence=(10.0, 40.0, 70.0), outgoing=np.arange(-80.0, 8
 
 
 def of_fit(fit: Any) -> dict[str, Any]:
-    """Optimum, cost, errors and identifiability."""
     found = {name: getattr(fit, name) for name in ("cost", "values", "standard_errors", "reduced_chi_square")}
     found["unidentified"] = [sorted(direction.weights) for direction in fit.unidentified]
     return found | {"at_bound": sorted(fit.at_bound), "insensitive": sorted(fit.insensitive)}
@@ -45,11 +43,6 @@ def example(name: str, data: Path, incidence: tuple[float, ...] | None = None) -
     measured = measured if incidence is None else measured.select(incidence=incidence)
     given = {name: getattr(problem, name) for name in ("transport", "noise", "scale")}
     return fits.fit(problem.stack, measured, starts=STARTS, **given)
-
-
-def fitted(name: str, data: Path) -> dict[str, Any]:
-    """What is found of one example."""
-    return of_fit(example(name, data))
 
 
 def held_out() -> dict[str, Any]:
@@ -96,7 +89,6 @@ def mixture() -> dict[str, Any]:
 
 
 def texels() -> dict[str, Any]:
-    """A map of 16 by 16 texels."""
     from tests.helpers import quick_maps
 
     with tempfile.TemporaryDirectory() as folder:
@@ -118,7 +110,6 @@ def structures() -> dict[str, Any]:
 
 
 def compared() -> dict[str, Any]:
-    """Two stacks on one data set, by cross-validation."""
     found = {name: example(name, COATINGS / DATA["anoblack"]) for name in ("coated_diffuse", "rough_conductor")}
     scores = {row.name: row.model_score for row in fits.compare(found, refit=True).rows}
     columns = ("elpd_diff", "dse", "weight")
@@ -127,7 +118,6 @@ def compared() -> dict[str, Any]:
 
 
 def posterior() -> dict[str, Any]:
-    """A posterior of two parameters and a scale."""
     free = lj.Stack([lj.Interface(fits.Free(1.4, 1.2, 2.2), fits.Free(0.3, 0.02, 1.0))], lj.Lambertian(0.4))
     data = fits.simulate(COATED, GEOMETRY, transport=lj.Statistical(), noise=0.05, seed=0)
     fit = fits.fit(free, data, transport=lj.Statistical(), noise=fits.Noise(relative=0.05), starts=STARTS)
@@ -148,53 +138,46 @@ DATA = {
 STACKS = sorted(path.stem for path in EXAMPLES.glob("*.toml"))
 PAIRS = [("nite", stack) for stack in STACKS] + [(name, "coated_diffuse") for name in DATA if name != "nite"]
 CASES: dict[str, Callable[[], dict[str, Any]]] = {
-    **{f"{name}-{stack}": partial(fitted, stack, COATINGS / DATA[name]) for name, stack in PAIRS},
+    **{
+        f"{name}-{stack}": partial(lambda *given: of_fit(example(*given)), stack, COATINGS / DATA[name])
+        for name, stack in PAIRS
+    },
     **{case.__name__: case for case in (held_out, joint, slab, mixture, posterior)},
     **{"map": texels, "search": structures, "compare": compared},
 }
-
 
 LIMITS = dict.fromkeys(("cost", "bic"), 1e-6) | dict.fromkeys(("reduced_chi_square", "standard_errors", "errors"), 1e-3)
 LIMITS |= {"values": 0.01, "quantiles": 0.1, "elpd_diff": 0.01, "weight": 0.01, "prediction": 0.35}
 
 
-def spread_of(prediction: dict[str, Any] | None) -> dict[str, Any]:
-    """Standard deviations of what was predicted, from the ends of its 95 % intervals."""
-    if prediction is None:
-        return {}
-    low, mean, high = (np.array(prediction[name]) for name in ("low", "mean", "high"))
-    sd = (high - low) / 3.92
-    return dict.fromkeys(("low", "mean", "high"), sd) | {"median_error": np.median(sd / np.abs(mean))}
+def units_of(stored: dict[str, Any]) -> dict[str, Any]:
+    """In what differences are measured, by key; what has no unit here is compared relative to itself."""
+    score = {one: max(error, 1.0) for one, error in stored.get("dse", {}).items()}
+    units = {"values": stored.get("standard_errors", stored.get("errors")), "quantiles": stored.get("sd")}
+    units |= {"elpd_diff": score, "weight": score}
+    if "prediction" in stored:  # standard deviations, from the ends of 95 % intervals
+        low, mean, high = (np.array(stored["prediction"][name]) for name in ("low", "mean", "high"))
+        sd = (high - low) / 3.92
+        units["prediction"] = {"low": sd, "mean": sd, "high": sd, "median_error": np.median(sd / np.abs(mean))}
+    return units
 
 
 def differences(name: str, stored: dict[str, Any], found: dict[str, Any]) -> list[str]:
     """Sentences on what differs by more than the stated tolerances."""
-    said: list[str] = []
-    score = {one: max(error, 1.0) for one, error in stored.get("dse", {}).items()}
-    units = {"values": stored.get("standard_errors", stored.get("errors")), "quantiles": stored.get("sd")}
-    units |= {"elpd_diff": score, "weight": score, "prediction": spread_of(stored.get("prediction"))}
-
-    def compare(key: str, old: Any, new: Any, tolerance: float, unit: Any = None) -> None:
-        if not isinstance(old, dict):
-            old, new = np.asarray(old, float), np.asarray(new, float)
-            unit = np.abs(old if unit is None else np.asarray(unit, float))
-            same = (old == new) | (np.isnan(old) & np.isnan(new))
-            apart = np.where(same, 0.0, np.abs(new - old) / np.where(unit > 0.0, unit, 1.0))
+    said, units = [], units_of(stored)
+    for key in sorted(stored.keys() - {"dse", "sd"}):
+        old, new, unit = stored[key], found[key], units.get(key) or stored[key]
+        if key not in LIMITS or (isinstance(old, dict) and sorted(old) != sorted(new)):
+            said += [f"{name}: {key}: {new}, was {old}"] if new != old else []
+            continue
+        for one in old if isinstance(old, dict) else [""]:
+            old_one, new_one, size = (np.asarray(each[one] if one else each, float) for each in (old, new, unit))
+            same = (old_one == new_one) | (np.isnan(old_one) & np.isnan(new_one))
+            apart = np.where(same, 0.0, np.abs(new_one - old_one) / np.where(np.abs(size) > 0.0, np.abs(size), 1.0))
             worst = int(np.argmax(np.nan_to_num(apart, nan=np.inf)))
-            if not apart.flat[worst] <= tolerance:
-                numbers = f"{new.flat[worst]:.8g}, was {old.flat[worst]:.8g}, off {apart.flat[worst]:.2g}"
-                said.append(f"{name}: {key}: {numbers}")
-        elif sorted(old) != sorted(new):
-            said.append(f"{name}: {key}: of {sorted(new)}, was of {sorted(old)}")
-        else:
-            for one in old:
-                compare(f"{key} of {one}", old[one], new[one], tolerance, None if unit is None else unit[one])
-
-    for key, old in stored.items():
-        if key in LIMITS:
-            compare(key, old, found[key], LIMITS[key], units.get(key))
-        elif key not in ("dse", "sd") and old != found[key]:
-            said.append(f"{name}: {key}: {found[key]}, was {old}")
+            if not apart.flat[worst] <= LIMITS[key]:
+                numbers = f"{new_one.flat[worst]:.8g}, was {old_one.flat[worst]:.8g}, off {apart.flat[worst]:.2g}"
+                said.append(f"{name}: {key} {one}: {numbers}")
     return said
 
 
