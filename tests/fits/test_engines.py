@@ -17,6 +17,7 @@ from fits.engines import Failure, connected, local_cluster, run
 from layerjax.compiling import CACHE_DIRECTORY, CACHE_LEAST_TIME
 from tests.helpers import tasks
 from tests.helpers.places import ROOT
+from tests.helpers.refusals import refuses
 from tests.helpers.tasks import running, started, wait_until
 
 dask, distributed = pytest.importorskip("dask"), pytest.importorskip("distributed")
@@ -53,15 +54,12 @@ def test_results_and_failures_do_not_depend_on_the_engine(request, cluster):
     with pytest.raises(OSError, match="No space left") as full:
         list(run(tasks.picky, None, [0, 3, 5], **engine))
     assert (full.value.errno, full.value.filename) == (errno.ENOSPC, "full.csv")
-    with pytest.raises(TypeError, match="a mistake in the code"):
-        list(run(tasks.picky, None, [0, 4, 5], **engine))
+    refuses("a mistake in the code", list, run(tasks.picky, None, [0, 4, 5], **engine), error=TypeError)
     transport = {"transport": lambda stack, wi, wo: None}
     assert dict(run(tasks.nothing, transport, [1], **engine)) == {0: None}
-
-
-def test_a_single_thread_is_that_of_the_caller():
-    results = run(lambda shared, task: threading.get_ident(), None, range(4), threads=1)
-    assert list(results) == [(index, threading.get_ident()) for index in range(4)]
+    if not cluster:  # a single thread is that of the caller
+        results = run(lambda shared, task: threading.get_ident(), None, range(4), threads=1)
+        assert list(results) == [(index, threading.get_ident()) for index in range(4)]
 
 
 def test_a_worker_has_the_settings_of_its_parent(client):
@@ -95,8 +93,7 @@ def test_a_scheduler_that_stops_is_named(tmp_path):
         results = run(tasks.slow, str(tmp_path), range(100), client=client)
         next(results)
         cluster.sync(cluster.scheduler.close)
-        with pytest.raises(OSError, match="the scheduler has stopped"):
-            list(results)
+        refuses("the scheduler has stopped", list, results, error=OSError)
 
 
 def test_leaving_the_loop_cancels_what_was_submitted(client, tmp_path):
@@ -133,15 +130,13 @@ def test_workers_end_with_their_parent(tmp_path, sent):
 
 def test_what_is_no_cluster_is_refused(client, monkeypatch):
     def refused(message, error=ValueError, **more):
-        with pytest.raises(error, match=message):
-            list(run(tasks.nothing, None, [1], **more))
+        refuses(message, list, run(tasks.nothing, None, [1], **more), error=error)
 
     for address in (3, "", "head", "8786"):
         refused(f"client is {address!r}; it must be a distributed.Client, or the address", client=address)
     with dask.config.set({"distributed.comm.timeouts.connect": "1s"}):
         refused(r"tcp://127\.0\.0\.1:9: there is no scheduler", OSError, client="tcp://127.0.0.1:9")
-    with pytest.raises(ValueError, match="cannot be pickled for the workers"):
-        list(run(tasks.nothing, threading.Lock(), [1], client=client))
+    refuses("cannot be pickled for the workers", list, run(tasks.nothing, threading.Lock(), [1], client=client))
     monkeypatch.setitem(sys.modules, "distributed", None)
     refused(r'client= needs distributed: pip install "layerjax\[distributed\]"', client="tcp://127.0.0.1:9")
     refused("processes > 1 needs distributed", processes=2)

@@ -13,6 +13,7 @@ import pytest
 from fits._files import write_text
 from fits.store import Store, differences, fingerprint
 from tests.helpers.files import contents, largest_file, read_only
+from tests.helpers.refusals import refuses
 from tests.helpers.stores import keys
 from tests.helpers.tasks import started
 
@@ -64,17 +65,9 @@ def steps_of(store):
 
 def test_records_come_back(tmp_path):
     path = tmp_path / "store"
-    record = {
-        "coords": np.arange(24.0).reshape(2, 4, 3),
-        "state": ["MT19937", np.arange(5, dtype=np.uint32), 3, 0.1],
-        "nothing": None,
-        "cost": float("inf"),
-        "worst": np.float64("nan"),
-        "count": np.int64(3),
-        "none": np.zeros((0, 3)),
-        "device": jnp.ones(2),
-        "words": {"ä": True},
-    }
+    record = {"coords": np.arange(24.0).reshape(2, 4, 3), "none": np.zeros((0, 3)), "device": jnp.ones(2)}
+    record |= {"state": ["MT19937", np.arange(5, dtype=np.uint32), 3, 0.1], "nothing": None, "words": {"ä": True}}
+    record |= {"cost": float("inf"), "worst": np.float64("nan"), "count": np.int64(3)}
     with Store.open(path, WHOSE) as store:
         for name in ("old", "new"):
             store.put("record", {"name": name})
@@ -91,8 +84,7 @@ def test_records_come_back(tmp_path):
             np.testing.assert_equal(found, record)
             for key in ("coords", "none", "device"):
                 assert found[key].dtype == record[key].dtype
-        with pytest.raises(TypeError, match="object cannot be kept in a store"):
-            again.put("record", {"it": object()})
+        refuses("object cannot be kept in a store", again.put, "record", {"it": object()}, error=TypeError)
     assert [one.name for one in tmp_path.iterdir()] == ["store"]
 
 
@@ -122,8 +114,7 @@ def test_readers_change_nothing_and_a_second_writer_is_refused(tmp_path):
             before = contents(tmp_path)
             assert (f"{path}-journal" in before) == (hold == "within")
             assert steps_of(Store.read(path)) == 6
-            with pytest.raises(ValueError, match=rf"store is in use by another process \({process.pid}\)"):
-                Store.open(path, WHOSE).__enter__()
+            refuses(rf"store is in use by another process \({process.pid}\)", Store.open(path, WHOSE).__enter__)
             assert contents(tmp_path) == before
         with read_only(path.parent):
             assert steps_of(Store.read(path)) == 6
@@ -172,9 +163,8 @@ def test_damage_is_reported_and_never_read(tmp_path):
     assert reported > len(places) / 2
     for length in (100, 4096, len(whole) - 4096):
         path.write_bytes(whole[:length])
-        for call in (Store.read, lambda path: Store.open(path, WHOSE).__enter__()):
-            with pytest.raises(ValueError, match="store: damaged, or no store of this version"):
-                call(path)
+        refuses("store: damaged, or no store of this version", Store.read, path)
+        refuses("store: damaged, or no store of this version", Store.open(path, WHOSE).__enter__)
     with Store.open(path, WHOSE, fresh=True) as store:
         assert keys(store) == []
 
@@ -186,11 +176,9 @@ def test_what_is_no_store_is_left_alone(tmp_path):
         connection.commit()
     before = contents(tmp_path)
     for name in ("text", "database"):
-        with pytest.raises(ValueError, match=f"{name}: damaged, or no store"):
-            Store.open(tmp_path / name, WHOSE, replace=True).__enter__()
+        refuses(f"{name}: damaged, or no store", Store.open(tmp_path / name, WHOSE, replace=True).__enter__)
     assert contents(tmp_path) == before
-    with pytest.raises(FileNotFoundError, match="absent"):
-        Store.read(tmp_path / "absent")
+    refuses("absent", Store.read, tmp_path / "absent", error=FileNotFoundError)
     (tmp_path / "absent").touch()  # killed as it was made
     assert keys(Store.read(tmp_path / "absent")) == []
     fill(tmp_path / "absent")
@@ -201,8 +189,7 @@ def test_the_work_of_another_problem_is_refused_by_name(tmp_path):
     fill(path)
     before = contents(tmp_path)
     other = fingerprint(data=np.arange(4.0), seed=1)
-    with pytest.raises(ValueError, match=r"holds the work of another problem \(data, seed 0, not 1\)"):
-        Store.open(path, other).__enter__()
+    refuses(r"holds the work of another problem \(data, seed 0, not 1\)", Store.open(path, other).__enter__)
     assert contents(tmp_path) == before
     with Store.open(path, other, replace=True) as store:
         assert keys(store) == []

@@ -13,6 +13,7 @@ import pytest
 import fits
 import layerjax as lj
 from tests.helpers.data_files import RXT
+from tests.helpers.refusals import refuses
 
 STACK = lj.Stack([], lj.Lambertian(fits.Free(0.5, 0.0, 1.0)))
 PLAIN = lj.Stack([], lj.Lambertian(0.5))
@@ -22,6 +23,14 @@ FIT = fits.fit(STACK, DATA, starts=1)
 FITTED = {"stack": STACK, "data": DATA}
 MANY = {"files": "a.csv", "stacks": "a.toml", "out": "there"}
 FREE = {"start": 0.5, "low": 0.0, "high": 1.0}
+LAZY = [fits.__name__, *(f"fits.{one.name}" for one in pkgutil.iter_modules(fits.__path__) if one.ispkg)]
+SWITCHES = [
+    (name, one.name, "None" in str(one.annotation))
+    for name in fits.__all__
+    if callable(getattr(fits, name)) and name not in ("Fit", "Posterior", "Search")  # results, made by fits alone
+    for one in inspect.signature(getattr(fits, name)).parameters.values()
+    if one.annotation in (bool, bool | None, "bool", "bool | None")
+]
 
 
 def every_field(of: type) -> str:
@@ -88,20 +97,11 @@ CASES = [
 @pytest.mark.parametrize(("name", "argument", "kind"), CASES)
 def test_it_is_refused_by_name(name, argument, kind, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    with pytest.raises((TypeError, ValueError), match=argument) as caught:
-        getattr(fits, name)(**CALLS[name][0] | {argument: WRONG[kind]})
-    assert "\n" not in str(caught.value)
-    assert len(str(caught.value)) < 300
+    given = CALLS[name][0] | {argument: WRONG[kind]}
+    words = refuses(argument, getattr(fits, name), **given, error=(TypeError, ValueError))
+    assert "\n" not in words
+    assert len(words) < 300
     assert not list(tmp_path.iterdir())
-
-
-SWITCHES = [
-    (name, one.name, "None" in str(one.annotation))
-    for name in fits.__all__
-    if callable(getattr(fits, name)) and name not in ("Fit", "Posterior", "Search")  # results, made by fits alone
-    for one in inspect.signature(getattr(fits, name)).parameters.values()
-    if one.annotation in (bool, bool | None, "bool", "bool | None")
-]
 
 
 @pytest.mark.parametrize(("name", "argument", "optional"), SWITCHES)
@@ -112,17 +112,15 @@ def test_a_switch_is_true_or_false(name, argument, optional, tmp_path, monkeypat
     if name in ("read_slab", "ReadOptions"):  # options are looked at as the file is read
         call = partial(fits.read if name == "ReadOptions" else fits.read_slab, "slab.rxt")
     for given in ("no", 0, *(() if optional else (None,))):
-        with pytest.raises(ValueError, match=rf"{argument}: {given!r} is not True.* or ") as caught:
-            call(**CALLS.get(name, ({}, ""))[0] | {argument: given})
-        assert "\n" not in str(caught.value)
+        options = CALLS.get(name, ({}, ""))[0] | {argument: given}
+        assert "\n" not in refuses(rf"{argument}: {given!r} is not True.* or ", call, **options)
     assert [path.name for path in tmp_path.iterdir()] == ["slab.rxt"]
 
 
 @pytest.mark.parametrize("given", [np.ones((3, 3)), "data.csv", None])
 def test_what_is_no_measurements_is_told_how_to_read_them(given):
-    for call in (lambda: fits.fit(STACK, given), lambda: fits.search(given), lambda: fits.predict(FIT, given)):
-        with pytest.raises(ValueError, match=r"is not a .*Measurements; fits\.read\(path\) reads a file, fits\.Meas"):
-            call()
+    for call, first in ((fits.fit, (STACK,)), (fits.search, ()), (fits.predict, (FIT,))):
+        refuses(r"is not a .*Measurements; fits\.read\(path\) reads a file, fits\.Meas", call, *first, given)
 
 
 def test_missing_files_are_named(tmp_path):
@@ -131,9 +129,6 @@ def test_missing_files_are_named(tmp_path):
         with pytest.raises(FileNotFoundError) as caught:
             getattr(fits, name)(missing)
         assert caught.value.filename == str(missing)
-
-
-LAZY = [fits.__name__, *(f"fits.{one.name}" for one in pkgutil.iter_modules(fits.__path__) if one.ispkg)]
 
 
 @pytest.mark.parametrize("name", LAZY)
