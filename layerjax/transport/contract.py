@@ -327,7 +327,8 @@ def refuse_anisotropic(stack: Stack, names: Sequence[str], transport: str) -> No
         if isinstance(part, Interface | Conductor) and part.is_anisotropic:
             raise ValueError(
                 f"{name}.alpha_y: {transport} carries no facets of two widths; AddingDoubling and RandomWalk with "
-                "facet_multiple_scattering=False do, and of a bare or hazy metal SingleScattering and SpongeCake"
+                "facet_multiple_scattering=False do, Statistical for GGX normals, and of a bare or hazy metal "
+                "SingleScattering and SpongeCake"
             )
 
 
@@ -335,6 +336,11 @@ def require_ggx(stack: Stack, names: Sequence[str], transport: str) -> None:
     """Raise a ValueError that names the first facets that are not GGX of one width, on behalf of a transport without
     others."""
     refuse_anisotropic(stack, names, transport)
+    refuse_other_normals(stack, names, transport)
+
+
+def refuse_other_normals(stack: Stack, names: Sequence[str], transport: str) -> None:
+    """Raise a ValueError that names the first facets that are not GGX, on behalf of a transport without others."""
     for name, part in [*zip(names, stack.layers, strict=True), ("base", stack.base)]:
         if isinstance(part, Interface | Conductor) and part.distribution != "ggx":
             others = "" if part.distribution == "gtr" else ", and ENDF for metals, coated metals and slabs"

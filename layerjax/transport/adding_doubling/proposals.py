@@ -20,7 +20,7 @@ from layerjax.transport.adding_doubling.tables import Tables, read_energies
 from layerjax.transport.first_order import FirstOrder, ReflectingInterface, SmoothOrder
 from layerjax.transport.lobes.microfacet import MicrofacetLobes, index_below, microfacet_lobes, reference_index
 from layerjax.transport.lobes.sampling import draw_lobe, lobe_density
-from layerjax.transport.lobes.statistics import Options
+from layerjax.transport.lobes.statistics import Options, is_anisotropic
 from layerjax.transport.single_scattering import SingleScattering
 from layerjax.transport.specular import has_specular, is_smooth, specular_shares
 
@@ -149,7 +149,8 @@ def _density(state: LayeredState, wi: Vector, wo: Vector, *, upward: bool) -> Ar
 def _mixture(state: LayeredState, wi: Vector, upward: bool) -> _Mixture:
     """Energies of the lobes by statistics; of what is diffuse: what the solution has behind the face, less those."""
     stack = state.stack
-    lobes = microfacet_lobes(stack, Options(state.multiple, "orders", False, False), wi[2], upward)
+    plane = wi[:2] if is_anisotropic(stack) else None
+    lobes = microfacet_lobes(stack, Options(state.multiple, "orders", False, False), wi[2], upward, plane)
     zero = jnp.zeros_like(wi[2])
     outside = flip(wi) if upward else wi
     deltas = specular_shares(stack, outside) if has_specular(stack) else ((zero,), (zero,))

@@ -3,6 +3,7 @@
 Energies are tuples by scattering order: entry k is the energy of the paths with k collisions in media, the last entry
 that of all with as many or more; without scattering media there is one. Each entry has an array for every channel, or
 one for all, as variances have: at one texel or cosine these are a few numbers, and side by side they stay in registers.
+Variances are numbers, or tensors where facets have two widths (`variance_tensor`).
 
 The printed equations are corrected: the factor J of Eq. 36 also multiplies the variance of the way down, and the series
 is in sigma_23^R + sigma_21^R; J counts from the medium that a variance is in to the outside.
@@ -17,6 +18,7 @@ from jax import Array
 from layerjax import channels
 from layerjax._numerics import clamp_max, clamp_min
 from layerjax.channels import Channels, map_channels
+from layerjax.transport.lobes.variance_tensor import Variance, Variances, limit_variance
 
 Orders = tuple[Channels, ...]
 
@@ -45,9 +47,9 @@ class Element(NamedTuple):
     t12: Orders
     r21: Orders
     t21: Orders
-    widening: Channels
-    down: Channels
-    up: Channels
+    widening: Variances
+    down: Variances
+    up: Variances
     jacobian: Channels
 
 
@@ -61,9 +63,9 @@ class UpperStatistics(NamedTuple):
     t0: Orders
     ri: Orders
     ti: Orders
-    s_t0: Channels
-    s_ri: Channels
-    s_ti: Channels
+    s_t0: Variances
+    s_ri: Variances
+    s_ti: Variances
     jacobian: Channels
 
 
@@ -71,7 +73,7 @@ class Lobe(NamedTuple):
     """Energy and variance at the side where it leaves."""
 
     energy: Orders
-    variance: Channels
+    variance: Variances
 
 
 def identity(cosine: Array) -> UpperStatistics:
@@ -89,14 +91,14 @@ def add_element(above: UpperStatistics, element: Element) -> tuple[Lobe, UpperSt
     rr = map_channels(lambda turned: turned / clamp_min(1.0 - turned, LEAST_ESCAPE), sum_orders(between))
     turns = map_channels(lambda rr, w, s: rr * (w + s), rr, element.widening, above.s_ri)
     variance = map_channels(  # Eq. (36)
-        lambda s_ti, j, s_t0, w, turns: clamp_max(s_ti + j * (s_t0 + w + turns), MOST_VARIANCE),
+        lambda s_ti, j, s_t0, w, turns: limit_variance(s_ti + j * (s_t0 + w + turns), MOST_VARIANCE),
         above.s_ti, above.jacobian, above.s_t0, element.widening, turns,
     )  # fmt: skip
     s_t0 = map_channels(  # Eqs. (47-49)
         lambda j, s, turns, d: (s + turns) / j + d, element.jacobian, above.s_t0, turns, element.down
     )
     s_ti = map_channels(  # Eq. (50)
-        lambda j, up, turns, s: clamp_max(j * (up + turns) + s, MOST_VARIANCE),
+        lambda j, up, turns, s: limit_variance(j * (up + turns) + s, MOST_VARIANCE),
         above.jacobian, element.up, turns, above.s_ti,
     )  # fmt: skip
     back = multiply_orders(element.t21, above.ri, element.t12, inverse)
@@ -116,7 +118,7 @@ def add_element(above: UpperStatistics, element: Element) -> tuple[Lobe, UpperSt
     )
 
 
-def _mean_variance(reflected: Array, crossed: Array, widening: Array, through: Array) -> Array:
+def _mean_variance(reflected: Array, crossed: Array, widening: Variance, through: Variance) -> Variance:
     """Eq. (51): of what the element itself reflects and of what comes back from above it."""
     total = reflected + crossed
     returns = total > LEAST_ENERGY  # where hardly any light does, its width is that of the element alone

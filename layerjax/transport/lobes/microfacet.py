@@ -4,8 +4,9 @@ Nothing is prepared: all of it is computed at the requested cosines, from energi
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jax import Array
 
@@ -14,20 +15,27 @@ from layerjax._numerics import clamp_min, safe_sqrt, unstack
 from layerjax.channels import Channels, map_channels
 from layerjax.directions import Vector
 from layerjax.microsurface.energy_tables import escape_cone_share, mirror_energy, single_reflectance
+from layerjax.normals.width_matrix import WidthMatrix, isotropic, width_matrix
+from layerjax.normals.widths import Widths
 from layerjax.stack import Interface, Stack
 from layerjax.surfaces import Conductor
 from layerjax.transport.lobes.statistics import (
     STEEPEST,
     Options,
+    Plane,
     Statistics,
     bound_alpha,
     facet_width,
     lobe_roughness,
+    mean_width,
     metal_levels,
     precision,
+    refract_plane,
     statistics,
+    width_seen,
 )
 from layerjax.transport.lobes.variance import bounded_refracted_cosine
+from layerjax.transport.lobes.variance_tensor import Variances, VarianceTensor, as_tensor, roughness_matrix
 
 LEAST_ENERGY = 1e-6
 """Least energy of an unscaled lobe that is divided by."""
@@ -41,13 +49,17 @@ Facet = tuple[Interface | Conductor, Array, bool]
 index of what it is in), and whether it is smooth."""
 
 
+LobeWidth = Array | WidthMatrix
+"""GGX width of a lobe; a matrix in stacks that have facets of two widths."""
+
+
 class MicrofacetLobe(NamedTuple):
     """A lobe by its energy, its energy over that of the unscaled lobe, and its roughness (None: the facet itself); and
     whether it is a delta, of light that has met smooth surfaces alone."""
 
     energy: Channels
     scale: Channels
-    alpha: Channels | None
+    alpha: tuple[Any, ...] | None  # a `LobeWidth` for all channels, or one for each
     specular: bool
 
 
@@ -55,7 +67,7 @@ class _Lobe(NamedTuple):
     """A lobe by its energy, its variance (None: the facet itself) and its cosine; and whether it is a delta."""
 
     energy: Channels
-    variance: Channels | None
+    variance: Variances | None
     cosine: Array
     specular: bool
 
@@ -84,32 +96,47 @@ class MicrofacetLobes(NamedTuple):
         """Energies that sampling goes by, mean of the channels."""
         return [channels.mean(lobe.energy) for lobe in (*self.reflected, *self.transmitted)]
 
-    def widths(self) -> tuple[list[Array], list[Array]]:
-        """GGX widths, mean of the channels: of those reflected, and of those transmitted."""
+    def widths(self) -> tuple[list[Any], list[Any]]:
+        """GGX widths, mean of the channels: of those reflected, and of those transmitted; all matrices if any is."""
         reflected, transmitted = ([self._width(lobe) for lobe in side] for side in (self.reflected, self.transmitted))
+        if any(isinstance(width, WidthMatrix) for width in reflected + transmitted):
+            return list(map(_as_matrix, reflected)), list(map(_as_matrix, transmitted))
         return reflected, transmitted
 
-    def _width(self, lobe: MicrofacetLobe) -> Array:
+    def _width(self, lobe: MicrofacetLobe) -> LobeWidth:
         if lobe.alpha is None:
             assert self.facet is not None
-            return facet_width(self.facet[0])
+            width = facet_width(self.facet[0])
+            return width_matrix(width) if isinstance(width, Widths) else width
+        if isinstance(lobe.alpha[0], WidthMatrix):
+            return jax.tree.map(lambda *entries: channels.mean(entries), *lobe.alpha)
         return bound_alpha(channels.mean(lobe.alpha))
 
 
-def microfacet_lobes(stack: Stack, options: Options, cosine: Array, upward: bool) -> MicrofacetLobes:
+def _as_matrix(width: LobeWidth) -> WidthMatrix:
+    return width if isinstance(width, WidthMatrix) else isotropic(width)
+
+
+def microfacet_lobes(
+    stack: Stack, options: Options, cosine: Array, upward: bool, plane: Plane | None = None
+) -> MicrofacetLobes:
     """Lobes of a simplified stack, lit from above, or from below (`upward`). Diffuse bases are omitted."""
     cosine = clamp_min(cosine, GRAZING)
-    found = statistics(stack, cosine, options, upward)
+    found = statistics(stack, cosine, options, upward, plane)
     reflected, facet = _reflected_lobes(found, cosine)
     transmitted, escaping = _transmitted_lobes(stack, found, cosine, upward)
-    alphas, unscaled = _alphas_and_energies(reflected, transmitted, escaping)
+    folded = None
+    if plane is not None:
+        outside = index_below(stack) if upward else jnp.ones(())
+        folded = refract_plane(plane, outside, reference_index(stack))
+    alphas, unscaled = _alphas_and_energies(reflected, transmitted, escaping, folded)
     if facet is not None:  # its lobe is the first
-        unscaled[0] = _facet_energy(*facet, cosine)
+        unscaled[0] = _facet_energy(*facet, cosine, plane)
     lobes = tuple(map(_scale, [*reflected, *transmitted], alphas, unscaled))
     return MicrofacetLobes(lobes[: len(reflected)], lobes[len(reflected) :], facet)
 
 
-def _scale(lobe: _Lobe, alpha: Channels, unscaled: Channels) -> MicrofacetLobe:
+def _scale(lobe: _Lobe, alpha: tuple[Any, ...], unscaled: Channels) -> MicrofacetLobe:
     scale = map_channels(lambda energy, whole: energy / clamp_min(whole, LEAST_ENERGY), lobe.energy, unscaled)
     return MicrofacetLobe(lobe.energy, scale, alpha or None, lobe.specular)
 
@@ -145,7 +172,7 @@ def _reflected_lobes(statistics: Statistics, cosine: Array) -> tuple[list[_Lobe]
     lobes = []
     for entry in statistics.reflected:
         for order, energy in enumerate(entry.lobe.energy):
-            sigma: Channels | None = None
+            sigma: Variances | None = None
             if entry.facet is not None and order == 0:
                 facet = entry.facet
             else:
@@ -178,37 +205,54 @@ def _transmitted_lobes(stack: Stack, statistics: Statistics, cosine: Array, upwa
 
 
 def _alphas_and_energies(
-    reflected: Sequence[_Lobe], transmitted: Sequence[_Lobe], escaping: Array
-) -> tuple[list[Channels], list[Channels]]:
+    reflected: Sequence[_Lobe], transmitted: Sequence[_Lobe], escaping: Array, folded: Plane | None
+) -> tuple[list[tuple[Any, ...]], list[Channels]]:
     """Roughness and unscaled energy of every lobe and channel, at one look; nothing for the facet itself.
 
-    escaping: of what is transmitted, the largest sine that is not totally reflected.
+    Of what is transmitted: escaping is the largest sine that is not totally reflected, folded the plane of the light.
     """
     lobes = [*reflected, *transmitted]
     parts = [(lobe.cosine, sigma) for lobe in lobes for sigma in lobe.variance or ()]
     if not parts:
         return [() for _ in lobes], [() for _ in lobes]
-    cosine, sigma = (jnp.stack(jnp.broadcast_arrays(*part)) for part in zip(*parts, strict=True))
-    alpha = lobe_roughness(sigma)
-    energy = mirror_energy(cosine, alpha)
+    cosine = jnp.stack(jnp.broadcast_arrays(*(cosine for cosine, _ in parts)))
+    alpha = _lobe_widths([sigma for _, sigma in parts])
+    energy = mirror_energy(cosine, mean_width(alpha))
     beyond = sum(len(lobe.variance or ()) for lobe in transmitted)
     if beyond:
-        cosine, width = cosine[-beyond:], alpha[-beyond:]
-        passed = energy[-beyond:] * escape_cone_share(cosine, width, escaping)
+        cosine, width = cosine[-beyond:], jax.tree.map(lambda entry: entry[-beyond:], alpha)
+        passed = energy[-beyond:] * escape_cone_share(cosine, width_seen(width, folded), escaping)
         energy = jnp.concatenate([energy[:-beyond], passed])
-    rows = zip(unstack(alpha), unstack(energy), strict=True)
+    rows = zip(_rows(alpha), unstack(energy), strict=True)
     found = [[next(rows) for _ in lobe.variance or ()] for lobe in lobes]
     return [tuple(a for a, _ in lobe) for lobe in found], [tuple(e for _, e in lobe) for lobe in found]
 
 
-def _order_variance(variance: Channels, spread: Channels | None, order: int) -> Channels:
+def _lobe_widths(sigmas: Sequence[Any]) -> LobeWidth:
+    """Roughness of lobes, one a row: matrices if any variance is a tensor."""
+    if not any(isinstance(sigma, VarianceTensor) for sigma in sigmas):
+        return lobe_roughness(jnp.stack(jnp.broadcast_arrays(*sigmas)))
+    tensors = list(map(as_tensor, sigmas))
+    entries = [*(one.xx for one in tensors), *(one.xy for one in tensors), *(one.yy for one in tensors)]
+    return roughness_matrix(VarianceTensor(*jnp.split(jnp.stack(jnp.broadcast_arrays(*entries)), 3)))
+
+
+def _rows(width: LobeWidth) -> list[Any]:
+    if not isinstance(width, WidthMatrix):
+        return unstack(width)
+    return [WidthMatrix(*row) for row in zip(*map(unstack, (width.xx, width.xy, width.yy)), strict=True)]
+
+
+def _order_variance(variance: Variances, spread: Channels | None, order: int) -> Variances:
     return variance if spread is None or order == 0 else map_channels(lambda v, s: v + order * s, variance, spread)
 
 
-def _facet_energy(what: Interface | Conductor, relative: Array, smooth: bool, cosine: Array) -> Channels:
+def _facet_energy(
+    what: Interface | Conductor, relative: Array, smooth: bool, cosine: Array, plane: Plane | None
+) -> Channels:
     """Energy that the facets of the first interface or base reflect at their first collision."""
     if isinstance(what, Conductor):
         return metal_levels(what, cosine, relative, multiple=False, smooth=smooth)
     if smooth:
         return (fresnel.dielectric(cosine, relative),)
-    return (single_reflectance(cosine, facet_width(what), relative),)
+    return (single_reflectance(cosine, width_seen(facet_width(what), plane), relative),)

@@ -18,6 +18,8 @@ from layerjax._numerics import clamp_max, clamp_min, unstack
 from layerjax.channels import Channels, map_channels, per_channel
 from layerjax.microsurface.directional_albedo import is_narrowest
 from layerjax.microsurface.energy_tables import conductor_energies, escape_cone_share, interface_energies
+from layerjax.normals.width_matrix import WidthMatrix, width_matrix
+from layerjax.normals.widths import Widths
 from layerjax.stack import Interface, Medium, Stack, is_known
 from layerjax.surfaces import Conductor
 from layerjax.transport.lobes.adding import Element, Lobe, add_element, identity, limit_escape
@@ -28,8 +30,18 @@ from layerjax.transport.lobes.variance import (
     transmission_scale,
     variance,
 )
+from layerjax.transport.lobes.variance_tensor import (
+    Variance,
+    VarianceTensor,
+    facet_variance,
+    roughness_matrix,
+    scale_width,
+)
 
 Scattering = Literal["orders", "single"]
+
+Plane = tuple[Array, Array]
+"""Components x and y of the direction of light, by which it sees facets of two widths."""
 
 STEEPEST = 0.999
 """Sine of refraction that stands in where no refracted direction exists (rough interfaces pass some light there)."""
@@ -92,17 +104,65 @@ def precision(stack: Stack) -> Any:
     return jnp.result_type(*(leaf for leaf in jax.tree.leaves(stack) if eqx.is_array(leaf)), jnp.float32)
 
 
+def is_anisotropic(stack: Stack) -> bool:
+    """Whether any facets have two widths, by structure."""
+    return any(isinstance(part, Interface | Conductor) and part.is_anisotropic for part in (*stack.layers, stack.base))
+
+
 def smooth_parts(stack: Stack) -> tuple[bool, ...]:
     """Of the layers and a base, which are known while tracing to be as narrow as can be: `Options.smooth`."""
     return tuple(
-        isinstance(part, Interface | Conductor) and (part.is_smooth or is_narrowest(part.alpha))
+        isinstance(part, Interface | Conductor) and (part.is_smooth or all(map(is_narrowest, _widths(part))))
         for part in (*stack.layers, stack.base)
     )
 
 
-def facet_width(surface: Interface | Conductor) -> Array:
-    """Width of the normals, 0 of a smooth surface."""
+def _widths(surface: Interface | Conductor) -> list[Any]:
+    return [surface.alpha, surface.alpha_y] if surface.is_anisotropic else [surface.alpha]
+
+
+def facet_width(surface: Interface | Conductor) -> Array | Widths:
+    """Width of the normals, or their two widths; 0 of a smooth surface."""
+    if surface.is_anisotropic:
+        return Widths(surface.alpha, surface.alpha_y, surface.tangent)
     return jnp.zeros((), jnp.result_type(surface.ior)) if surface.is_smooth else jnp.asarray(surface.alpha)
+
+
+def refract_plane(plane: Plane | None, outside: Array, inside: Array) -> Plane | None:
+    """Components of the direction of light in a medium, from those outside; those outside where it has a lower index,
+    beyond whose critical angle there are none."""
+    if plane is None:
+        return None
+    x, y = plane
+    factor = clamp_max(outside / inside, 1.0) / jnp.sqrt(clamp_min(x * x + y * y, 1.0))
+    return factor * x, factor * y
+
+
+def width_seen(width: Array | Widths | WidthMatrix, plane: Plane | None) -> Array:
+    """Width whose energies stand for those of facets, or of a lobe, that may have two.
+
+    Interfaces reflect and let pass what they mask along the azimuth of the light; energies at widths (.02, .1) to (.3,
+    .9), seven angles and three azimuths, were off by 0.004 (rms; 0.02 at most) in reflection, 0.024 (0.12) in
+    transmission, and 0.05 (0.2) from inside.
+
+    Args:
+        plane: of the direction of the light, where it meets the facets; None: the mean over azimuths.
+    """
+    if isinstance(width, Widths):
+        width = width_matrix(width)
+    if not isinstance(width, WidthMatrix):
+        return width
+    return width.mean_width if plane is None else width.width_seen(*plane)
+
+
+def mean_width(width: Array | Widths | WidthMatrix) -> Array:
+    """Width of mirrors that reflect as much as those of two widths, which lose what leaves along all azimuths.
+
+    At the same widths and angles energies were off by 0.03 (rms; 0.11 at most).
+    """
+    if isinstance(width, Widths):
+        width = width_matrix(width)
+    return width.mean_width if isinstance(width, WidthMatrix) else width
 
 
 def parts(stack: Stack, upward: bool, smooth: tuple[bool, ...] | None = None) -> list[Part]:
@@ -121,7 +181,9 @@ def parts(stack: Stack, upward: bool, smooth: tuple[bool, ...] | None = None) ->
     return found
 
 
-def statistics(stack: Stack, cosine: Array, options: Options, upward: bool = False) -> Statistics:
+def statistics(
+    stack: Stack, cosine: Array, options: Options, upward: bool = False, plane: Plane | None = None
+) -> Statistics:
     """Lobes of a simplified stack, lit along cosines > 0, from below if `upward`. Diffuse bases are omitted."""
     met = parts(stack, upward, options.smooth)
     above = identity(cosine)
@@ -130,7 +192,7 @@ def statistics(stack: Stack, cosine: Array, options: Options, upward: bool = Fal
     depth: Channels = (jnp.zeros_like(cosine),)
     over: Array | None = None  # index above the nearest interface so far
     cosines = [bounded_refracted_cosine(cosine, part.above / met[0].above, STEEPEST)[0] for part in met]
-    interfaces = iter(_interfaces(met, cosines, options))
+    interfaces = iter(_interfaces(met, cosines, options, plane))
     specular = True
     for (what, index, below, smooth), here in zip(met, cosines, strict=True):
         if isinstance(what, Medium):
@@ -142,10 +204,10 @@ def statistics(stack: Stack, cosine: Array, options: Options, upward: bool = Fal
                 depth = channels.total([depth, optical])
             _, above = add_element(above, element)
             continue
-        alpha = facet_width(what)
         specular = specular and what.is_smooth
         if over is not None:  # some of the light on its way up is totally reflected: Eqs. (32-35)
-            width = jnp.stack([roughness(sigma + variance(alpha)) for sigma in above.s_t0])
+            own, inside = facet_variance(facet_width(what)), refract_plane(plane, met[0].above, index)
+            width = jnp.stack([width_seen(_width(sigma + own), inside) for sigma in above.s_t0])
             above = limit_escape(above, tuple(escape_cone_share(here, width, over / index)))
         element = _conductor(what, here, index, options, smooth) if isinstance(what, Conductor) else next(interfaces)
         lobe, above = add_element(above, element)
@@ -163,13 +225,19 @@ def _mean_spread(depth: Array, spread: Array, optical: Array, mean: Array) -> Ar
     return (depth * spread + optical * mean) / clamp_min(depth + optical, LEAST_DEPTH)
 
 
-def _interfaces(met: Sequence[Part], cosines: Sequence[Array], options: Options) -> list[Element]:
+def _width(sigma: Variance) -> Array | WidthMatrix:
+    return roughness_matrix(sigma) if isinstance(sigma, VarianceTensor) else roughness(sigma)
+
+
+def _interfaces(met: Sequence[Part], cosines: Sequence[Array], options: Options, plane: Plane | None) -> list[Element]:
     """Elements of all interfaces: the energies of the rough ones together, at one look."""
     chosen = [k for k, part in enumerate(met) if isinstance(part.what, Interface)]
     if not chosen:
         return []
     cosine = jnp.stack([cosines[k] for k in chosen])
-    alpha = _rows([facet_width(met[k].what) for k in chosen], cosine)
+    widths = [facet_width(met[k].what) for k in chosen]
+    planes = [refract_plane(plane, met[0].above, met[k].above) for k in chosen]
+    alpha = _rows(list(map(width_seen, widths, planes)), cosine)
     ior = _rows([jnp.asarray(met[k].below / met[k].above) for k in chosen], cosine)
     smooth = [met[k].smooth for k in chosen]
     refracted, exists = bounded_refracted_cosine(cosine, ior, STEEPEST)
@@ -181,10 +249,18 @@ def _interfaces(met: Sequence[Part], cosines: Sequence[Array], options: Options)
     one = jnp.ones_like(cosine)
     steep_i, steep_t = (cosine, refracted) if options.angles else (one, one)
     jacobian = ior * refracted / cosine
-    widening = variance(alpha) * one
-    down = variance(transmission_scale(steep_i, ior, steep_t) * alpha)
-    up = variance(transmission_scale(steep_t, 1.0 / ior, steep_i) * alpha)
-    rows = zip(*map(unstack, (r12, t12, r21, t21, widening, down, up, jacobian)), strict=True)
+    down_scale, up_scale = transmission_scale(steep_i, ior, steep_t), transmission_scale(steep_t, 1.0 / ior, steep_i)
+    variances: list[Any]
+    if any(isinstance(width, Widths) for width in widths):
+        variances = [
+            [facet_variance(scale_width(*row)) for row in zip(widths, unstack(scale), strict=True)]
+            for scale in (one, down_scale, up_scale)
+        ]
+    else:
+        variances = [
+            unstack(x) for x in (variance(alpha) * one, variance(down_scale * alpha), variance(up_scale * alpha))
+        ]
+    rows = zip(*map(unstack, (r12, t12, r21, t21)), *variances, unstack(jacobian), strict=True)
     return [
         Element(
             r12=((above_r,),),
@@ -201,7 +277,9 @@ def _interfaces(met: Sequence[Part], cosines: Sequence[Array], options: Options)
 
 
 def _rows(values: Sequence[Array], like: Array) -> Array:
-    """Numbers, one for each row of an array."""
+    """Numbers, one for each row of an array; or rows."""
+    if any(jnp.ndim(value) for value in values):
+        return jnp.stack([jnp.broadcast_to(value, like.shape[1:]) for value in values])
     return jnp.stack(values).reshape(-1, *(1,) * (like.ndim - 1))
 
 
@@ -220,11 +298,10 @@ def _dielectric(
 
 
 def _conductor(base: Conductor, cosine: Array, index: Array, options: Options, smooth: bool) -> Element:
-    alpha = facet_width(base)
     levels = metal_levels(base, cosine, index, options.multiple, smooth)
     zero, one = (jnp.zeros_like(cosine),), (jnp.ones_like(cosine),)
     dark = (zero,)  # nothing passes
-    return Element((levels,), dark, dark, dark, (variance(alpha) * one[0],), zero, zero, one)
+    return Element((levels,), dark, dark, dark, (facet_variance(facet_width(base)) * one[0],), zero, zero, one)
 
 
 def metal_levels(base: Conductor, cosine: Array, index: Array, multiple: bool, smooth: bool) -> Channels:
@@ -232,7 +309,7 @@ def metal_levels(base: Conductor, cosine: Array, index: Array, multiple: bool, s
     ior, k = (tuple(x / index for x in per_channel(jnp.asarray(value))) for value in (base.ior, base.k))
     if smooth:
         return map_channels(lambda ior, k: fresnel.conductor(cosine, ior, k), ior, k)
-    return conductor_energies(cosine, jnp.asarray(base.alpha), ior, k, multiple)
+    return conductor_energies(cosine, mean_width(facet_width(base)), ior, k, multiple)
 
 
 def _medium(medium: Medium, cosine: Array, options: Options) -> tuple[Element, tuple[Channels, Array] | None]:

@@ -20,19 +20,20 @@ from layerjax._checks import require_choice
 from layerjax._devices import exact_products
 from layerjax._numerics import horizon, safe_div, safe_sqrt
 from layerjax._parameters import is_placeholder
-from layerjax.channels import Channels
+from layerjax.channels import Channels, map_channels
 from layerjax.directions import Vector, add, dot, flip, half_vector, reflect, sanitise, select
 from layerjax.microsurface.energy_tables import LARGEST_INDEX
-from layerjax.normals.facets import reflection_pdf
-from layerjax.normals.ggx import ggx_area, ggx_density, ggx_sample
+from layerjax.normals.ggx import ggx_area, ggx_density
+from layerjax.normals.width_matrix import WidthMatrix, matrix_area, matrix_density
 from layerjax.quadrature import gauss_legendre
 from layerjax.stack import Interface, Medium, Stack
 from layerjax.surfaces import Conductor, Surface
 from layerjax.surfaces.interface import interface_reflection
-from layerjax.transport.contract import TEXELS, DeterministicTransport, Side, refuse_film, require_ggx
+from layerjax.transport.contract import TEXELS, DeterministicTransport, Side, refuse_film, refuse_other_normals
 from layerjax.transport.known_directions import DirectionLookup
 from layerjax.transport.lobes.microfacet import (
     Facet,
+    LobeWidth,
     MicrofacetLobes,
     fold,
     index_below,
@@ -40,8 +41,10 @@ from layerjax.transport.lobes.microfacet import (
     reference_index,
     unfold,
 )
-from layerjax.transport.lobes.statistics import Options, Scattering, bound_alpha, smooth_parts
+from layerjax.transport.lobes.sampling import facet_pdf, sample_facet
+from layerjax.transport.lobes.statistics import Options, Plane, Scattering, bound_alpha, is_anisotropic, smooth_parts
 from layerjax.transport.specular import density_with_deltas, is_smooth, sample_with_deltas, specular_draws
+from layerjax.transport.statistical.brushed_base import with_one_width
 from layerjax.transport.statistical.coated_base import is_coated, make_coated
 from layerjax.transport.statistical.diffuse_base import make_diffuse
 from layerjax.transport.statistical.diffuse_lobe import make_diffuse_lobe, why_no_lobe
@@ -79,6 +82,11 @@ class StatisticalState(eqx.Module):
     def is_open(self) -> bool:
         """Whether there is no base."""
         return self.stack.base is None
+
+    @property
+    def is_anisotropic(self) -> bool:
+        """Whether any facets have two widths."""
+        return is_anisotropic(self.stack)
 
 
 class Statistical(DeterministicTransport):
@@ -130,7 +138,7 @@ class Statistical(DeterministicTransport):
                 raise ValueError(f"Statistical.{name}: {value!r} is not one of {allowed}")
 
     def check(self, stack: Stack, names: Sequence[str]) -> None:
-        require_ggx(stack, names, "Statistical")
+        refuse_other_normals(stack, names, "Statistical")
         refuse_film(stack, names, "Statistical")
         _check_indices(stack, names)
         for name, layer in zip(names, stack.layers, strict=True):
@@ -154,11 +162,11 @@ class Statistical(DeterministicTransport):
             if not stack.layers:
                 diffuse = stack.base
             elif self.diffuse == "lobe":
-                diffuse = make_diffuse_lobe(stack)
+                diffuse = make_diffuse_lobe(with_one_width(stack))
             elif self._needs_solver(stack):
-                diffuse = make_diffuse(stack, stack.base, self.facet_multiple_scattering)
+                diffuse = make_diffuse(with_one_width(stack), stack.base, self.facet_multiple_scattering)
             else:
-                diffuse = _closed_form(stack)
+                diffuse = _closed_form(with_one_width(stack))
         return StatisticalState(stack, diffuse, index_below(stack), reference_index(stack), smooth_parts(stack))
 
     def traceable_equivalent(self, stack: Stack, known: DirectionLookup) -> "Statistical | None":
@@ -240,14 +248,16 @@ class Statistical(DeterministicTransport):
             self.diffuse != "tables" or not self.facet_multiple_scattering or not (is_streamed(stack) or is_hazy(stack))
         )
 
-    def _microfacet_lobes(self, state: StatisticalState, cosine: Array, upward: bool) -> MicrofacetLobes:
+    def _microfacet_lobes(
+        self, state: StatisticalState, cosine: Array, upward: bool, plane: Plane | None
+    ) -> MicrofacetLobes:
         options = Options(self.facet_multiple_scattering, self.scattering, self.angles, self.own_side, state.smooth)
-        return microfacet_lobes(state.stack, options, cosine, upward).without_deltas()
+        return microfacet_lobes(state.stack, options, cosine, upward, plane).without_deltas()
 
     def _lobes(self, state: StatisticalState, wi: Vector, upward: bool) -> MicrofacetLobes:
         """For light along wi, above (`upward`: turned up); of light that comes from elsewhere, whatever is finite."""
         lit = wi[2] > horizon(wi[2].dtype)
-        return self._microfacet_lobes(state, jnp.where(lit, wi[2], 1.0), upward)
+        return self._microfacet_lobes(state, jnp.where(lit, wi[2], 1.0), upward, _plane(state, wi))
 
     def _energies(self, state: StatisticalState, wi: Vector, nodes: int, upward: bool) -> Energies:
         if self.symmetric:
@@ -260,7 +270,10 @@ class Statistical(DeterministicTransport):
         valid = (wi[2] > edge) & (wo[2] > edge)
         wi, wo = sanitise(wi, valid), sanitise(wo, valid)
         h, cosine = half_vector(wi, wo, same_side=True)
-        found = self._microfacet_lobes(state, cosine if self.symmetric else wi[2], upward)
+        if self.symmetric:
+            found = self._microfacet_lobes(state, cosine, upward, _common_plane(state, wi, wo, 1.0))
+        else:
+            found = self._microfacet_lobes(state, wi[2], upward, _plane(state, wi))
         lobes = []
         for lobe in found.reflected:
             if lobe.alpha is None:
@@ -285,16 +298,20 @@ class Statistical(DeterministicTransport):
         h, _ = half_vector(a, b, same_side=True)
         if self.symmetric:
             sine = _half_sine(a, b) * state.reference
-            found = [self._microfacet_lobes(state, safe_sqrt(1.0 - sine * sine), False)] * 2
+            plane = _common_plane(state, a, b, state.reference)
+            found = [self._microfacet_lobes(state, safe_sqrt(1.0 - sine * sine), False, plane)] * 2
         else:
-            found = [self._microfacet_lobes(state, w[2], upward) for w, upward in ((over, False), (under, True))]
+            found = [
+                self._microfacet_lobes(state, w[2], upward, _plane(state, w))
+                for w, upward in ((over, False), (under, True))
+            ]
         leaving = jnp.where(downward, ratio_under, ratio_over)
         lobes = []
         for above, below in zip(found[0].transmitted, found[1].transmitted, strict=True):
             assert above.alpha is not None
             assert below.alpha is not None
             scale = channels.select(downward, above.scale, below.scale)
-            alphas = channels.select(downward, above.alpha, below.alpha)
+            alphas = map_channels(partial(_select_width, downward), above.alpha, below.alpha)
             shape = tuple(leaving * leaving * _lobe(h, a, b, alpha) for alpha in alphas)  # per solid angle outside
             lobes.append(channels.select(valid, channels.multiply(scale, shape)))
         return lobes
@@ -311,20 +328,20 @@ class Statistical(DeterministicTransport):
         near: list[Channels] = [(jnp.zeros_like(wi[2][..., 0]),)]
         far = list(near)
         for j, width in enumerate(reflected):
-            alpha = jnp.asarray(width)[..., None]
-            m = ggx_sample(wi, alpha, u1, u2)
+            alpha = jax.tree.map(lambda entry: jnp.asarray(entry)[..., None], width)
+            m = sample_facet(wi, alpha, u1, u2)
             wo = reflect(wi, m)
-            share = weight * safe_div(jnp.where(wo[2] > edge, wo[2], 0.0), reflection_pdf(m, wi, alpha))
+            share = weight * safe_div(jnp.where(wo[2] > edge, wo[2], 0.0), facet_pdf(m, wi, alpha))
             lobe = self._reflections(state, wi, wo, upward)[j]
             near.append(tuple(jnp.sum(share * value, axis=-1) for value in lobe))
         entry, exit = _ratios(state)[::-1] if upward else _ratios(state)
         turned = flip if upward else _identity
         for j, width in enumerate(transmitted):
-            alpha = width[..., None]
+            alpha = jax.tree.map(lambda entry: entry[..., None], width)
             a = fold(wi, entry)
-            m = ggx_sample(a, alpha, u1, u2)
+            m = sample_facet(a, alpha, u1, u2)
             b = reflect(a, m)
-            share = weight * safe_div(jnp.where(b[2] > edge, b[2], 0.0), exit * exit * reflection_pdf(m, a, alpha))
+            share = weight * safe_div(jnp.where(b[2] > edge, b[2], 0.0), exit * exit * facet_pdf(m, a, alpha))
             lobe = self._transmissions(state, turned(wi), turned(unfold(b, exit)))[j]
             far.append(tuple(jnp.sum(share * value, axis=-1) for value in lobe))
         return channels.total(near), channels.total(far)
@@ -374,8 +391,28 @@ def _half_sine(wi: Vector, wo: Vector) -> Array:
     return 0.5 * safe_sqrt(dot(apart, apart))
 
 
-def _lobe(h: Vector, wi: Vector, wo: Vector, alpha: Array) -> Array:
+def _plane(state: StatisticalState, w: Vector) -> Plane | None:
+    """Components by which light along w sees facets of two widths; None if there are none."""
+    return w[:2] if state.is_anisotropic else None
+
+
+def _common_plane(state: StatisticalState, wi: Vector, wo: Vector, index: Array | float) -> Plane | None:
+    """Those of the symmetric model, by half the difference of the directions (as long as the sine of their angle to
+    the half vector), outside a medium of this index."""
+    if not state.is_anisotropic:
+        return None
+    return 0.5 * index * (wi[0] - wo[0]), 0.5 * index * (wi[1] - wo[1])
+
+
+def _select_width(chosen: Array, width: LobeWidth, other: LobeWidth) -> Any:
+    return jax.tree.map(partial(jnp.where, chosen), width, other)
+
+
+def _lobe(h: Vector, wi: Vector, wo: Vector, alpha: LobeWidth) -> Array:
     """GGX lobe of facets that reflect all, D G / (4 cos cos), 1/sr."""
+    if isinstance(alpha, WidthMatrix):
+        area_i, area_o = matrix_area(wi, alpha), matrix_area(wo, alpha)
+        return matrix_density(h, alpha) / ((wi[2] + area_i) * (wo[2] + area_o))
     alpha = bound_alpha(alpha)
     area_i, area_o = ggx_area(wi, alpha), ggx_area(wo, alpha)
     return ggx_density(h, alpha) / ((wi[2] + area_i) * (wo[2] + area_o))
@@ -385,5 +422,5 @@ def _facet(facet: Facet, wi: Vector, wo: Vector) -> Channels:
     """The first interface or base itself, with Fresnel reflectance at its own facets."""
     what, relative, _ = facet
     if isinstance(what, Interface):
-        return (interface_reflection(wi, wo, relative, jnp.asarray(what.alpha)),)
+        return (interface_reflection(wi, wo, relative, what.width),)
     return what.relative_to(relative).evaluate(wi, wo)
