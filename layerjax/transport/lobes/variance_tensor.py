@@ -93,7 +93,8 @@ def as_tensor(sigma: Variance) -> VarianceTensor:
 def roughness_matrix(sigma: VarianceTensor) -> WidthMatrix:
     """The widths of a variance, within the range that lobes are evaluated in: `roughness` of a tensor.
 
-    alpha^1.1 = sigma / (1 + sigma) (Eq. 6) is a quotient of tensors; only the power takes eigenvalues.
+    alpha^1.1 = sigma / (1 + sigma) (Eq. 6) is a quotient of tensors; only the power takes eigenvalues. About a tangent
+    that is no axis, the smaller variance has the rounding of the larger one.
     """
     determinant = clamp_min(sigma.xx * sigma.yy - sigma.xy * sigma.xy, 0.0)
     whole = 1.0 + sigma.xx + sigma.yy + determinant

@@ -228,7 +228,7 @@ def test_solver_and_walk_agree(stack):
 
 def test_what_it_cannot_be_is_refused_by_name():
     stack = lj.Stack([lj.Interface(1.5, 0.3, alpha_y=0.4)], lj.Lambertian(0.6))
-    for transport in (lj.Statistical(), lj.WeidlichWilkie(), lj.AddingDoubling(facet_multiple_scattering=True)):
+    for transport in (lj.ENDF(), lj.WeidlichWilkie(), lj.AddingDoubling(facet_multiple_scattering=True)):
         with pytest.raises(ValueError, match=r"layers\[0\]\.alpha_y: .* carries no facets of two widths; Adding"):
             lj.prepare(stack, transport)
     with pytest.raises(ValueError, match=r"Interface\.alpha_y: 2 is outside \[0\.0001, 1\]"):
