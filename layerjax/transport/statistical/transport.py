@@ -97,6 +97,16 @@ class Statistical(DeterministicTransport):
     with a Henyey-Greenstein phase function (forward scattering only), and every base. Under layers, a diffuse base that
     is not Lambertian counts as f = A(i) A(o) / (pi rho), with its directional albedo A and the mean rho of A.
 
+    GGX facets may have two widths (`alpha_y`, `tangent`): variances are then tensors in the tangent plane, which are
+    rotated by the tangents before they add, and lobes have two widths. Energies are those of one width: that along the
+    azimuth of the light at an interface (the root mean square of the two at normal incidence), the root mean square for
+    metals, lobes, and interfaces over diffuse light. Beside `AddingDoubling`, without multiple scattering on facets,
+    the relative L2 error at widths (.2, .5) was that of the model with one width (in brackets, at their root mean
+    square): a coat of 0.1 on metal 9 % (9 %), of 0.3 29 % (30 %), brushed coats on metal of 0.1 34 % (33 %), on metal
+    brushed at another tangent 39 % (39 %), on a Lambertian base 1 % (0 %), slabs 33 % (30 %). Near the mirror direction
+    of a coat on metal of (.15, .4) values were 4 % too low along the tangent and 13 % across it (4 and 3 %). Energies
+    with ``facet_multiple_scattering`` have no reference: no other transport has it with two widths.
+
     The index of an `Interface` has to be 1/4 to 4 times that above it; a traced index beyond that counts as the nearer
     end. Derivatives by indices within 1e-4 of each other are finite but follow the interpolation error of the tables:
     3e-4 and less as a rule, 3e-3 under dyed coats of a lower index.
