@@ -343,7 +343,8 @@ def refuse_other_normals(stack: Stack, names: Sequence[str], transport: str) -> 
     """Raise a ValueError that names the first facets that are not GGX, on behalf of a transport without others."""
     for name, part in [*zip(names, stack.layers, strict=True), ("base", stack.base)]:
         if isinstance(part, Interface | Conductor) and part.distribution != "ggx":
-            others = "" if part.distribution == "gtr" else ", and ENDF for metals, coated metals and slabs"
+            by_endf = part.distribution == "beckmann" and not part.is_anisotropic
+            others = ", and ENDF for metals, coated metals and slabs" if by_endf else ""
             raise ValueError(
                 f'{name}.distribution: {transport} carries no "{part.distribution}" normals; AddingDoubling and '
                 f"RandomWalk with facet_multiple_scattering=False do{others}"
