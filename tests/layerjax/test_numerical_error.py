@@ -55,10 +55,10 @@ def test_errors_cover_random_stacks(kind, part):
 
 
 FALLS_SHORT = {
-    ("smooth coat on metal", 201): "lobes at grazing light fall between azimuths: 1e-3 of what is reflected repeatedly",
     ("haze on a mirror", 100): "the truth, of more than 96 nodes, is itself off by 1 % and more",
 }
 OTHERS = [(kind, seed) for kind in OTHER_INTERFACES for seed in (100, 101, 102) if kind != "haze on a mirror"]
+OTHERS.append(("smooth coat on metal", 201))  # narrow lobes at grazing light, which the coat reflects totally
 
 
 @pytest.mark.slow

@@ -20,13 +20,15 @@ from layerjax.transport.adding_doubling.operators import Layer, Parts
 from layerjax.transport.adding_doubling.sampling import modes_at_nodes, projected_weight, scale_to_energy
 
 
-def base_layer(region: Region, base: Surface, modes: int, multiple: bool) -> Layer:
-    """An opaque base under a region, as Fourier modes."""
+def base_layer(region: Region, base: Surface, modes: int, multiple: bool, *, grazing: bool = False) -> Layer:
+    """An opaque base under a region, as Fourier modes; grazing: see `modes_at_nodes`."""
     if isinstance(base, Conductor) and base.is_smooth:
         return Layer(Parts(None), mirror_top=jnp.stack(base.reflectance(region.cosine))[:, None])
     weight = projected_weight(region)
     is_metal = isinstance(base, Conductor)
-    kernels = modes_at_nodes(base.evaluate, region, region, modes, has_mirror_lobe=is_metal)
+    kernels = modes_at_nodes(
+        base.evaluate, region, region, modes, has_mirror_lobe=is_metal, grazing=grazing and is_metal
+    )
     if isinstance(base, Conductor):
         return Layer(_conductor(region, base, kernels, multiple))
     return Layer(Parts(jnp.stack(kernels) * weight[:, None]))

@@ -6,6 +6,7 @@ exprel(y), and what is caught on its way out scatters once more and leaves: righ
 slab loses nothing.
 """
 
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -18,7 +19,7 @@ from layerjax import fresnel
 from layerjax._numerics import exprel, mean_decay, safe_div, safe_sqrt
 from layerjax.channels import per_channel
 from layerjax.directions import Vector, half_vector
-from layerjax.phase import PhaseFunction
+from layerjax.phase import SGGX, PhaseFunction
 from layerjax.stack import Medium, is_known
 from layerjax.transport.adding_doubling.grid import Region
 from layerjax.transport.adding_doubling.moments import MomentCounts, kernel_of_moments, truncate
@@ -74,15 +75,24 @@ class Kernel(eqx.Module):
         return jnp.roll(split, self.azimuths // 2, axis=-1).reshape(values.shape)
 
 
-def kernel_modes(phase: PhaseFunction, with_schlick: bool, region: Region, modes: int, carried: MomentCounts) -> Kernel:
+def kernel_modes(
+    phase: PhaseFunction,
+    with_schlick: bool,
+    region: Region,
+    modes: int,
+    carried: MomentCounts,
+    *,
+    grazing: bool = False,
+) -> Kernel:
     """Kernel of a medium that is symmetric about the normal, as Fourier modes cos(m phi) in the azimuth of travel.
 
-    carried: moments, if the phase function has any.
+    carried: moments, if the phase function has any; grazing: of flakes, see `modes_at_nodes`.
     """
     area = phase.cross_section((region.sine, jnp.zeros_like(region.sine), region.cosine))
     if phase.moments(1) is not None:
         return _kernel_by_moments(phase, with_schlick, region, modes, carried, area)
-    truncated_kernel = modes_at_nodes(lambda wi, wo: _kernel_values(phase, with_schlick, wi, wo), region, region, modes)
+    values = partial(_kernel_values, phase, with_schlick)
+    truncated_kernel = modes_at_nodes(values, region, region, modes, grazing=grazing and isinstance(phase, SGGX))
     plain, schlick = (
         (truncated_kernel[0], truncated_kernel[1]),
         (truncated_kernel[2], truncated_kernel[3]) if with_schlick else None,

@@ -23,6 +23,16 @@ LEAST_SAMPLES = 96
 GRADING = 3
 """Power of the place, from 0 to 1, that azimuths go with where they are dense about the plane of incidence."""
 
+SQUEEZE, GRAZING_SAMPLES = 4.0, 3
+"""Of azimuths behind a smooth interface: how many times denser they are about the plane of incidence than on average,
+and how many there are at least for each mode.
+
+Facets of width alpha mirror light into azimuths of 2 alpha cot(theta): at grazing light a lobe is narrower than any
+azimuths are apart, and behind a smooth interface all of this light is totally reflected, and meets the metal again.
+Index 1.64 over alpha 0.12, 32 modes: 96 azimuths at equal distances, 3e-4 at any number of nodes; squeezed, 2e-6. Index
+1.5 over alpha 0.05, 96 modes: 192 at equal distances, 9e-3; 288 squeezed, 4e-5.
+"""
+
 MOST_ENTRIES = 1 << 18
 """Numbers that an array of kernels at azimuths holds at most."""
 
@@ -45,6 +55,7 @@ def modes_at_nodes(
     modes: int,
     *,
     has_mirror_lobe: bool = False,
+    grazing: bool = False,
 ) -> list[Array]:
     """Mean over azimuth of values(wi, wo) cos(m phi), (modes, out, in), for each array that the function returns.
 
@@ -53,11 +64,15 @@ def modes_at_nodes(
     has_mirror_lobe: the mean alone is taken at azimuths that are dense about the plane of incidence. At equal distances
     a narrow lobe would be met beside its middle alone, and would send light of one node to others that are closer than
     azimuths are: by a metal under a coat of alpha 1e-4 past the critical angle, a tenth of what comes in at 80 degrees.
+    grazing: so are the other modes, see `SQUEEZE`.
     """
-    samples = azimuths(modes)
-    place = (np.arange(samples) + 0.5) / samples
-    grading = GRADING if has_mirror_lobe and modes == 1 else 1
-    phi, weight = np.pi * place**grading, grading * place ** (grading - 1) / samples
+    if has_mirror_lobe and modes == 1:
+        phi, weight = _graded_azimuths()
+    elif grazing:
+        phi, weight = _squeezed_azimuths(modes)
+    else:
+        phi, weight = _equal_azimuths(azimuths(modes))
+    samples = phi.size
     dtype = into.cosine.dtype
     cosines = jnp.asarray(np.cos(np.outer(phi, np.arange(modes))) * weight[:, None], dtype)
     mu_i, sin_i = into.cosine[None, :, None], into.sine[None, :, None]
@@ -74,6 +89,25 @@ def modes_at_nodes(
     return [
         jnp.moveaxis(found, -1, 0) for found in (map_row_chunks(of_rows, rows, chunks) if chunks > 1 else of_rows(rows))
     ]
+
+
+def _equal_azimuths(samples: int) -> tuple[np.ndarray, np.ndarray]:
+    """Azimuths over half a turn, and their weights, whose sum is 1."""
+    return np.pi * ((np.arange(samples) + 0.5) / samples), np.full(samples, 1.0 / samples)
+
+
+def _graded_azimuths() -> tuple[np.ndarray, np.ndarray]:
+    """The same with a power of the place."""
+    place = (np.arange(LEAST_SAMPLES) + 0.5) / LEAST_SAMPLES
+    return np.pi * place**GRADING, GRADING * place ** (GRADING - 1) / LEAST_SAMPLES
+
+
+def _squeezed_azimuths(modes: int) -> tuple[np.ndarray, np.ndarray]:
+    """The same by a Moebius map, which squeezes tan(phi / 2): sums of periodic functions stay as exact."""
+    samples = max(GRAZING_SAMPLES * modes, LEAST_SAMPLES)
+    even, weight = _equal_azimuths(samples)
+    sine, cosine = np.sin(0.5 * even) / SQUEEZE, np.cos(0.5 * even)
+    return 2.0 * np.arctan2(sine, cosine), weight / SQUEEZE / (sine**2 + cosine**2)
 
 
 def cosines(x: Array, count: int) -> Array:

@@ -304,7 +304,8 @@ def _kernel(plan: Plan, region: int, fresnel: bool, tilted: bool, dtype: Any, nu
     indices, phase = numbers
     here = _grid(plan, indices, dtype).regions[region]
     if not tilted:
-        return kernel_modes(phase, fresnel, here, plan.modes, terms(plan.nodes, len(indices) > 1))
+        carried = terms(plan.nodes, len(indices) > 1)
+        return kernel_modes(phase, fresnel, here, plan.modes, carried, grazing=plan.common)
     assert plan.azimuths is not None
     return kernel_ordinates(phase, fresnel, here, plan.azimuths)
 
@@ -315,7 +316,7 @@ def _base(plan: Plan, region: int, dtype: Any, numbers: Any, _: None) -> Layer:
     base = _relative_conductor(base, here.ior)
     if is_tilted(base) and isinstance(base, Conductor) and plan.azimuths is not None:
         return anisotropic_metal(here, base, plan.azimuths)
-    return base_layer(here, base, plan.modes, plan.multiple)
+    return base_layer(here, base, plan.modes, plan.multiple, grazing=plan.common)
 
 
 def requested_stack(stack: Stack, known: DirectionLookup) -> tuple[Stack, KnownDirections] | None:

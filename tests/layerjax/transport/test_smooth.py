@@ -101,6 +101,26 @@ def test_an_absorbing_plate_between_two_media(side):
     np.testing.assert_allclose((found[0] + found[1])[:, 0], 1.0, rtol=1e-12)
 
 
+@pytest.mark.parametrize(
+    ("stack", "modes", "error"),
+    [
+        (lj.Stack([lj.Interface(1.64)], lj.Conductor(1.5, 1.7, 0.125)), 32, 2e-5),
+        pytest.param(
+            lj.Stack([lj.Interface(1.5), lj.Medium(1.0, 0.9, lj.SGGX("surface", 0.2))], lj.Lambertian(0.3)),
+            24,
+            2e-5,
+            marks=pytest.mark.slow,
+        ),
+    ],
+    ids=["metal", "flakes"],
+)
+def test_azimuths_resolve_light_that_a_smooth_coat_reflects_totally(stack, modes, error):
+    """Eight times the modes have six times the azimuths. At equal distances they were off by 2e-4 and 3e-4."""
+    pairs = lj.direction(np.deg2rad([30.0, 55.0]), 0.0), lj.direction(np.deg2rad([[30.0], [55.0]]), 0.0)
+    found, fine = (lj.evaluate(stack, *pairs, lj.AddingDoubling(nodes=12, modes=m)) for m in (modes, 8 * modes))
+    np.testing.assert_allclose(found, fine, rtol=error)
+
+
 def test_lobes_of_a_smooth_furnace():
     """Deepest reflection by deepest reflection, for indices 1.3, 1.0, 1.3, 1.0, 1.3 over a mirror: as published, to the
     3e-7 that those figures are from k equal faces in a row, which reflect k F / (1 + (k - 1) F)."""
