@@ -27,6 +27,9 @@ from layerjax.normals.widths import azimuth_of_tangent
 from layerjax.phase import HenyeyGreenstein, PhaseFunction
 from layerjax.surfaces import Conductor, Surface, ThinFilm
 
+MATCHED = 64.0 * float(np.finfo(np.float32).eps)
+"""Relative difference of indices up to which light may pass unrefracted (see `surfaces.interface.is_index_matched`)."""
+
 LEAST_EXTINCTION = 1e-10
 """In 1/mm, stands for 0 where derivatives by the coefficients of a turbid medium may be needed."""
 
@@ -77,7 +80,8 @@ class Interface(Facets, ReprModule):
     Light that is blocked by masking is lost, also where the index hardly changes: with ior 1.001 and alpha 0.3, light
     at 75 degrees loses 20 % at a crossing, and a base that is lit and viewed at 75 degrees is 36 % darker. Transports
     with ``facet_multiple_scattering=True`` include this light. Omit an interface where the index does not change; one
-    with exactly the index above it, and no film, is omitted automatically.
+    with exactly the index above it, and no film, is omitted automatically. With a film it has to be smooth there: what
+    rough facets pass unrefracted is a delta, and a `ValueError` says that no transport carries it.
     """
 
     ior: Parameter = parameter("Interface.ior")
@@ -254,6 +258,7 @@ def simplify_and_name(stack: Stack) -> tuple[Stack, tuple[str, ...]]:
             layer = _drop_film(layer)
             if layer.film is None and _are_equal(layer.ior, above):
                 continue
+            _refuse_delta_of_facets(f"layers[{index}]", layer, above)
             above, layer = layer.ior, _merge_widths(layer)
         if isinstance(layer, TurbidMedium):
             layer = _make_turbid_static(layer).as_medium()
@@ -272,6 +277,21 @@ def simplify_and_name(stack: Stack) -> tuple[Stack, tuple[str, ...]]:
     if len(layers) < len(stack.layers) or any(map(operator.is_not, layers, stack.layers)):
         stack = eqx.tree_at(lambda s: s.layers, stack, tuple(layers))
     return stack, tuple(names)
+
+
+def _refuse_delta_of_facets(name: str, face: Interface, above: Any) -> None:
+    """Raise a ValueError for a rough interface with a film between indices that are known to be equal."""
+    if face.is_smooth or face.film is None:
+        return
+    if any(isinstance(ior, jax.core.Tracer) or is_placeholder(ior) for ior in (face.ior, above)):
+        return
+    below, above = np.broadcast_arrays(np.asarray(face.ior), np.asarray(above))
+    matched = np.abs(below / above - 1.0) <= MATCHED
+    if np.any(matched):
+        raise ValueError(
+            f"{name}.ior: {below[matched][0]:g} is the index above it, and its facets have a film: what they pass is a "
+            "delta, which no transport carries; it may have another index, or be smooth (no alpha)"
+        )
 
 
 def _drop_film(part: Any) -> Any:

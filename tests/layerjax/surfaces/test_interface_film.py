@@ -265,6 +265,32 @@ def test_a_film_between_equal_indices_stays():
     np.testing.assert_allclose(np.stack([mirrored, passed], -1), expected, rtol=1e-10)
 
 
+def test_rough_films_between_equal_indices_are_refused():
+    """Their facets reflect, but refract nothing: the rest is a delta."""
+    above, inside = lj.Interface(1.0, 0.3, film=FILM), lj.Interface(1.3, 0.3, "beckmann", film=FILM)
+    for stack, message in (
+        (lj.Stack([above]), r"layers\[0\]\.ior: 1 is the index above it, and its facets have a film"),
+        (lj.Stack([above], lj.Lambertian(0.5)), r"layers\[0\]\.ior: 1 is"),
+        (lj.Stack([lj.Medium(1.0), lj.Interface(1.3), inside]), r"layers\[2\]\.ior: 1\.3 is"),
+    ):
+        for call in (
+            lambda stack: lj.evaluate(stack, WI, WI, COARSE),
+            lambda stack: lj.albedo(stack, WI, lj.RandomWalk(paths=64), key=jax.random.key(0)),
+            lambda stack: lj.sample(stack, WI, jax.random.key(0), COARSE),
+            lambda stack: lj.specular(stack, WI),
+            lambda stack: lj.goniophotometer(stack, WI, key=jax.random.key(0), paths=64),
+        ):
+            with pytest.raises(ValueError, match=message):
+                call(stack)
+    with pytest.raises(ValueError, match=r"layers\[1\]\.ior: 1\.4 is"):  # of a map
+        lj.specular(lj.Stack([lj.Interface(np.array([1.5, 1.4])), lj.Interface(1.4, 0.3, film=FILM)]), WI)
+    # a film without thickness is none, and next to it light is refracted
+    assert simplify(lj.Stack([lj.Interface(1.0, 0.3, film=lj.ThinFilm(1.5, 0.0, RGB))])).layers == ()
+    near = lj.Stack([lj.Interface(1.01, 0.3, film=FILM)])
+    energies = np.sum([*lj.albedo(near, WI, lj.AddingDoubling(nodes=24, modes=4)), *lj.specular(near, WI)], axis=0)
+    assert np.all((energies > 0.9) & (energies < 1.0))
+
+
 def test_it_counts_channels_and_is_shown():
     stack = lj.Stack([lj.Interface(1.5, 0.3, film=FILM)])
     assert stack.channels == 3
