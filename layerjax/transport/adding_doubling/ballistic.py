@@ -1,13 +1,17 @@
 """Light that passes a slab by two refractions, at its two interfaces, and meets nothing between: in closed form.
 
+So is light that a mirror sends back through the rough interface that let it in: seen in the mirror, that is a slab, and
+the two refractions are at the same interface. A smooth interface in the place of the mirror has a critical angle, which
+the points of the facets do not resolve: what it sends back is left to the grid.
+
 Both lobes may be narrower than the nodes are apart, which then miss where they overlap. The directions between
 are integrated over along the facets that either side sees, and the two sums weighed against each other (Veach & Guibas
 1995): the narrower lobe gives the points, the wider the values.
 """
 
-from collections.abc import Sequence
-from functools import partial
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from functools import partial, reduce
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -17,15 +21,18 @@ from jax import Array
 from layerjax import fresnel
 from layerjax._batching import map_row_chunks
 from layerjax._numerics import horizon, safe_sqrt, smooth_step
-from layerjax.channels import Channels, count, map_channels, per_channel, pick, total
+from layerjax.channels import Channels, count, map_channels, pick, total
 from layerjax.directions import Vector, flip, sanitise, select
 from layerjax.stack import Interface, Medium, Stack, optical_depths
+from layerjax.surfaces import Surface
 from layerjax.surfaces.interface import continued_transmission, is_index_matched
 from layerjax.surfaces.thin_film import BARE, films_of
 from layerjax.transport.adding_doubling.facet_scattering import Normals, facet_spacing, refracted_rays
 from layerjax.transport.adding_doubling.operators import (
     Layer,
     Operator,
+    Parts,
+    add,
     add_operators,
     matmul,
     multiply,
@@ -33,8 +40,8 @@ from layerjax.transport.adding_doubling.operators import (
     scale_rows,
 )
 from layerjax.transport.adding_doubling.requested_directions import requested_region, turn
-from layerjax.transport.adding_doubling.resolution import has_tilted
-from layerjax.transport.specular import is_smooth
+from layerjax.transport.adding_doubling.resolution import has_tilted, mirrors_in_closed_form
+from layerjax.transport.specular import Crossed, crossed_layers, is_smooth, ray_shares, region_indices
 
 POINTS = (16, 12)
 """Points a panel, and in azimuth, of the facets of either side."""
@@ -50,12 +57,41 @@ TINY = 1e-18
 """1/sr: of two lobes that are less the weights do not matter; their squares are none in single precision."""
 
 
+class Slab(eqx.Module):
+    """Media between two interfaces."""
+
+    media: tuple[Medium, ...]
+
+    def passed(self, w: Vector) -> Channels:
+        """Share of light along w, in the first region, that reaches the second interface."""
+        depths = total([*optical_depths(self.media, w), (jnp.zeros_like(w[2]),)])
+        return tuple(jnp.exp(-depth) for depth in depths)
+
+
+class Mirror(eqx.Module):
+    """Media behind an interface, and the mirror that sends light back to it: see `ray_shares`."""
+
+    layers: tuple[Crossed, ...]
+    outside: Array
+    base: Surface | None
+
+    def passed(self, w: Vector) -> Channels:
+        """Share of light along -w that comes back to the interface."""
+        return ray_shares(self.layers, self.outside, self.base, w)[0]
+
+
 class Ballistic(eqx.Module):
-    """The two interfaces, and the media above, between and below them."""
+    """The two interfaces, what is between them, and the media above and below.
+
+    crosses: whether light leaves on the other side. Else the second interface is the first, as it is seen in the
+    mirror, and what lies below is what lies above.
+    """
 
     upper: Interface
     lower: Interface
-    media: tuple[tuple[Medium, ...], tuple[Medium, ...], tuple[Medium, ...]]
+    interior: Slab | Mirror
+    outside: tuple[tuple[Medium, ...], tuple[Medium, ...]]
+    crosses: bool = eqx.field(static=True)
 
 
 class BTDFLobe(NamedTuple):
@@ -65,20 +101,37 @@ class BTDFLobe(NamedTuple):
     ended: Array
 
 
-def ballistic_paths(stack: Stack) -> Ballistic | None:
-    """What light passes by two refractions alone; None, if none does."""
-    faces = _faces(stack)
-    if faces is None:
-        return None
-    parts = (stack.layers[: faces[0]], stack.layers[faces[0] + 1 : faces[1]], stack.layers[faces[1] + 1 :])
-    upper, lower = (stack.layers[k] for k in faces)
-    assert isinstance(upper, Interface)
-    assert isinstance(lower, Interface)
-    above, between, below = (tuple(layer for layer in part if isinstance(layer, Medium)) for part in parts)
-    return Ballistic(upper, lower, (above, between, below))
+def ballistic_paths(stack: Stack) -> tuple[Ballistic, ...]:
+    """What light passes by two refractions alone."""
+    found = []
+    faces = _slab_faces(stack)
+    if faces is not None:
+        parts = (stack.layers[: faces[0]], stack.layers[faces[0] + 1 : faces[1]], stack.layers[faces[1] + 1 :])
+        upper, lower = (stack.layers[k] for k in faces)
+        assert isinstance(upper, Interface)
+        assert isinstance(lower, Interface)
+        above, between, below = map(_media, parts)
+        found.append(Ballistic(upper, lower, Slab(between), (above, below), True))
+    if mirrors_in_closed_form(stack):
+        found.append(_mirrored_path(stack))
+    return tuple(found)
 
 
-def _faces(stack: Stack) -> tuple[int, int] | None:
+def _media(layers: Sequence[Any]) -> tuple[Medium, ...]:
+    return tuple(layer for layer in layers if isinstance(layer, Medium))
+
+
+def _mirrored_path(stack: Stack) -> Ballistic:
+    layers = crossed_layers(stack, region_indices(stack))
+    place = next(k for k, (layer, _, _) in enumerate(layers) if isinstance(layer, Interface))
+    upper, _, inside = layers[place]
+    lower = eqx.tree_at(lambda face: face.ior, upper, jnp.ones_like(inside))
+    media = _media(stack.layers[:place])
+    return Ballistic(upper, lower, Mirror(tuple(layers[place + 1 :]), inside, stack.base), (media, media), False)
+
+
+def _slab_faces(stack: Stack) -> tuple[int, int] | None:
+    """The two interfaces of a slab, if both are rough and no other part is an interface or a base."""
     if has_tilted(stack):  # what they pass goes with the azimuth
         return None
     if any(map(is_smooth, stack.layers)):  # it is bent on its way
@@ -89,19 +142,58 @@ def _faces(stack: Stack) -> tuple[int, int] | None:
 
 def subtract_ballistic(stack: Stack, layers: Sequence[Layer], whole: Layer) -> Layer:
     """The whole stack without the light that passes by two refractions alone, as its layers have it."""
-    faces = _faces(stack)
-    if faces is None:
-        return whole
-    down = _double_refraction([(layer.transmit_down.first, layer.direct_down) for layer in layers], faces)
-    upward = [(layer.transmit_up.first, layer.direct_up) for layer in reversed(layers)]
-    up = _double_refraction(upward, [len(layers) - 1 - place for place in faces])
+    down = [(layer.transmit_down.first, layer.direct_down) for layer in layers]
+    up = [(layer.transmit_up.first, layer.direct_up) for layer in layers]
+    faces = _slab_faces(stack)
+    if faces is not None:
+        mirrored = [len(layers) - 1 - place for place in faces]
+        once = _double_refraction(down, faces), _double_refraction(up[::-1], mirrored)
+        whole = _subtract(whole, lambda layer: (layer.transmit_down.rest, layer.transmit_up.rest), once)
+    places = [place for place, layer in enumerate(stack.layers) if isinstance(layer, Interface)]
+    is_mirror = stack.base is not None and layers[-1].mirror_top is not None  # the base itself may be a stand-in
+    if is_mirror and len(places) == 1 and not is_smooth(stack.layers[places[0]]) and not has_tilted(stack):
+        stop = places[0] + 1
+        back = _double_passage(down[:stop], up[:stop], _mirrors(layers[stop:]).mirror_top)
+        whole = _subtract(whole, lambda layer: (layer.reflect_top.rest,), (back,))
+    return whole
 
-    def rest(layer: Layer) -> tuple[Operator, Operator]:
-        return layer.transmit_down.rest, layer.transmit_up.rest
 
+def _subtract(whole: Layer, parts: Callable[[Layer], tuple[Operator, ...]], less: Sequence[Array]) -> Layer:
     return eqx.tree_at(
-        rest, whole, tuple(add_operators(part, -once) for part, once in zip(rest(whole), (down, up), strict=True))
+        parts, whole, tuple(add_operators(part, -once) for part, once in zip(parts(whole), less, strict=True))
     )
+
+
+def _mirrors(layers: Sequence[Layer]) -> Layer:
+    """What mirrors and media alone do, layer on layer."""
+    alone = [
+        Layer(
+            Parts(None),
+            direct_down=layer.direct_down,
+            direct_up=layer.direct_up,
+            mirror_top=layer.mirror_top,
+            mirror_bottom=layer.mirror_bottom,
+        )
+        for layer in layers
+    ]
+    return reduce(lambda below, above: add(above, below), reversed(alone))
+
+
+def _double_passage(
+    inward: Sequence[tuple[Operator, Operator]], outward: Sequence[tuple[Operator, Operator]], mirror: Operator
+) -> Array:
+    """Flux that passes the last of these layers, comes back from the mirror behind it, and passes it again.
+
+    inward, outward: what each layer passes with one event, and what untouched, in the order in which light comes in.
+    """
+    (into, _), (out, _) = inward[-1], outward[-1]
+    before: Operator = jnp.ones(1)
+    after: Operator = jnp.ones(1)
+    for (_, direct), (_, back) in zip(inward[:-1], outward[:-1], strict=True):
+        before, after = multiply(before, direct), multiply(after, back)
+    passed = scale_rows(after, matmul(out, scale_rows(mirror, scale_columns(into, before))))
+    assert passed is not None
+    return passed
 
 
 def _double_refraction(layers: Sequence[tuple[Operator, Operator]], faces: Sequence[int]) -> Array:
@@ -123,10 +215,10 @@ def _double_refraction(layers: Sequence[tuple[Operator, Operator]], faces: Seque
 
 
 def evaluate_ballistic(state: Ballistic, wi: Vector, wo: Vector) -> Channels:
-    """BSDF of that light; wi and wo on either side, 0 for pairs on one side."""
+    """BSDF of that light, 0 for pairs on other sides than those where it comes in and leaves."""
     shape = jnp.broadcast_shapes(wi[2].shape, wo[2].shape)
     downward = wi[2] > 0
-    over, under = select(downward, wi, wo), flip(select(downward, wo, wi))
+    over, under = (select(downward, wi, wo), flip(select(downward, wo, wi))) if state.crosses else (wi, wo)
     if 0 in shape:
         return (jnp.zeros(shape, over[2].dtype),)
     edge = horizon(over[2].dtype)
@@ -138,14 +230,14 @@ def evaluate_ballistic(state: Ballistic, wi: Vector, wo: Vector) -> Channels:
     def nothing(*pairs: Array) -> Channels:
         return tuple(jnp.zeros(found.shape, found.dtype) for found in jax.eval_shape(passed, *pairs))
 
-    def some(rows: list[Array]) -> Channels:  # pairs on one side, which often lie together, are omitted
+    def some(rows: list[Array]) -> Channels:  # pairs on other sides, which often lie together, are omitted
         crossing, *pairs = rows
         return jax.lax.cond(jnp.any(crossing), passed, nothing, *pairs)
 
     rays = rows[0].size * 8 * POINTS[0] * POINTS[1]
     found = map_row_chunks(some, rows, rays // BATCH_RAYS)
     outside = total(
-        [*optical_depths(state.media[0], over), *optical_depths(state.media[2], flip(under)), (0.0 * over[2],)]
+        [*optical_depths(state.outside[0], over), *optical_depths(state.outside[1], flip(under)), (0.0 * over[2],)]
     )
     level = jnp.where(downward, 1.0, 1.0 / state.lower.ior**2)  # f / ior_o^2 is reciprocal
 
@@ -160,7 +252,8 @@ def _transmitted_bsdf(state: Ballistic, cosine_i: Array, cosine_o: Array, azimut
     films = [films_of(face.film) for face in (state.upper, state.lower)]
     if films == [BARE, BARE]:
         return _film_transmitted(state, (None, None), cosine_i, cosine_o, azimuth)
-    channels = max(count(*films), *(count(per_channel(medium.thickness)) for medium in state.media[1]), 1)
+    zero = jnp.zeros_like(cosine_i)
+    channels = max(count(*films), len(state.interior.passed((zero, zero, zero + 1.0))))
     found = []
     for c in range(channels):
         values = _film_transmitted(state, (pick(films[0], c), pick(films[1], c)), cosine_i, cosine_o, azimuth)
@@ -194,12 +287,11 @@ def _film_transmitted(
     ]
 
     def parts(x: Array, y: Array, z: Array) -> tuple[BTDFLobe, BTDFLobe, Channels]:
-        """g_i, g_o / n_below^2 and what media pass, of travel along (x, y, -z) between the interfaces."""
+        """g_i, g_o / n_below^2 and what comes across, of travel along (x, y, -z) between the interfaces."""
         middle: Vector = (-x, -y, z)
         g_i = _lobe((x, y, z), over, ratios[0], faces[0], edges[1], of_inner[0])
         g_o = _lobe(middle, under, ratios[1], faces[1], edges[0], of_inner[1])
-        depths = total([*optical_depths(state.media[1], middle), (jnp.zeros_like(z),)])
-        return g_i, BTDFLobe(*(part / below**2 for part in g_o)), tuple(jnp.exp(-depth) for depth in depths)
+        return g_i, BTDFLobe(*(part / below**2 for part in g_o)), state.interior.passed(middle)
 
     # a BTDF at equal indices is a delta: then the rays of that side are the whole
     delta_i, delta_o = is_index_matched(inner), is_index_matched(inner / below)

@@ -29,9 +29,9 @@ LEAST_FACETS, LEAST_OF_SEVERAL = 16, 24
 interface, and where there are several, between which light continues."""
 
 DENSER = 3
-"""Times as many in either direction where a mirror sends light back: it passes the same facets twice, and nodes must
-not distinguish them. Index 1.27 and alpha 0.4 over a mirror, at 75 degrees: 4.82 at 24 nodes, 21.7 at 96, without; the
-walk has 4.776 +- 0.005."""
+"""Times as many in either direction where a mirror sends light back through facets that no closed form knows: it passes
+the same facets twice, and nodes must not distinguish them. Index 1.7 and alpha 0.3 under a smooth one of 1.3 and over a
+mirror, at 69 degrees: 3.79 at 32 nodes without, 3.744 with; the walk has 3.742 +- 0.008."""
 
 CRITICAL = 7.5
 """Times the distance between facets: half the width over which the critical angle of refraction is rounded off."""

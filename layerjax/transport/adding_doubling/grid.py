@@ -72,7 +72,7 @@ class Region(eqx.Module):
 class Grid(eqx.Module):
     """Nodes of all panels in s, and the regions from top to bottom. common: whether all regions have the same nodes,
     also in a panel that regions of slightly different indices share. mirrored: whether light that an interface passes
-    comes back to it as it is."""
+    comes back to it as it is, and not in closed form."""
 
     edges: Array
     least_width: Array

@@ -281,6 +281,9 @@ def _refracted_lobes(stack: Stack, assumed: float) -> Iterator[tuple[float, floa
     """
     faces = [layer for layer in stack.layers if isinstance(layer, Interface)]
     smooth = [face.is_smooth for face in faces]
+    if mirrors_in_closed_form(stack):  # what is left of light that is mirrored has met the facets from inside
+        yield _least_width(faces[0], assumed), max(1.0, _least(faces[0].ior, ASSUMED_INDEX))
+        return
     mirror = isinstance(stack.base, Conductor) and stack.base.is_smooth
     in_closed_form = len(faces) == 2 and not has_tilted(stack)
     if not (any(smooth) or mirror) and (stack.base is not None or len(faces) < 2 or in_closed_form):
@@ -316,6 +319,14 @@ def resolutions(stack: Stack) -> Iterator[Resolution]:
     tilted = has_tilted(stack)
     for step in ORDINATES if tilted else RESOLUTIONS:
         yield Resolution(*RESOLUTIONS[0], step) if tilted else Resolution(*step, ORDINATES[0])
+
+
+def mirrors_in_closed_form(stack: Stack) -> bool:
+    """Whether a mirror lies under a single interface, which is rough: what it sends back through the facets is known in
+    closed form, see `ballistic`."""
+    faces = [layer for layer in stack.layers if isinstance(layer, Interface)]
+    is_mirror = isinstance(stack.base, Conductor) and stack.base.is_smooth
+    return is_mirror and len(faces) == 1 and not faces[0].is_smooth and not has_tilted(stack)
 
 
 def has_tilted(stack: Stack) -> bool:

@@ -34,7 +34,7 @@ from layerjax.transport.adding_doubling.media import Kernel, kernel_modes, kerne
 from layerjax.transport.adding_doubling.moments import terms
 from layerjax.transport.adding_doubling.operators import Layer, add
 from layerjax.transport.adding_doubling.requested_directions import requested_region
-from layerjax.transport.adding_doubling.resolution import Resolution, has_tilted
+from layerjax.transport.adding_doubling.resolution import Resolution, has_tilted, mirrors_in_closed_form
 from layerjax.transport.known_directions import DirectionLookup, KnownDirections
 from layerjax.transport.specular import is_smooth
 
@@ -58,13 +58,13 @@ class Plan(eqx.Module):
     common: bool = eqx.field(static=True, default=False)
     """Whether all regions have the same nodes, which smooth interfaces refract to each other."""
     mirrored: bool = eqx.field(static=True, default=False)
-    """Whether a smooth surface sends back what rough interfaces let pass."""
+    """Whether a smooth surface sends back what rough interfaces let pass, and not in closed form."""
 
 
 def make_plan(stack: Stack, resolution: Resolution, multiple: bool) -> Plan:
     """The plan for a simplified stack."""
     common = any(map(is_smooth, stack.layers))
-    mirrored = common or is_smooth(stack.base)
+    mirrored = (common or is_smooth(stack.base)) and not mirrors_in_closed_form(stack)
     if has_tilted(stack):
         nodes, azimuths = resolution.ordinates
         return Plan(nodes, azimuths // 2 + 1, azimuths, ranks(stack), multiple, common, mirrored)

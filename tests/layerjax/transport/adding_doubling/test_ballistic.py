@@ -71,7 +71,7 @@ def test_pairs_on_one_side_are_zero_and_change_no_others(reverse):
     mixed = jnp.where(same_side[:, None], wi, wo)
 
     def values(alpha, wo):
-        return evaluate_ballistic(ballistic_paths(slab(1.5, alpha, 1.2, 0.1)), split(wi), split(wo))[0]
+        return evaluate_ballistic(ballistic_paths(slab(1.5, alpha, 1.2, 0.1))[0], split(wi), split(wo))[0]
 
     compiled = jax.jit(lambda alpha, wo: (values(alpha, wo), jax.jacfwd(values)(alpha, wo)))
     ahead, behind = (compiled(0.05 + step, wo)[0] for step in (1e-6, -1e-6))
