@@ -35,7 +35,6 @@ from layerjax.surfaces import Conductor
 from layerjax.transport.adding_doubling.ballistic import Ballistic, ballistic_paths, evaluate_ballistic
 from layerjax.transport.adding_doubling.elements import (
     LinearElement,
-    compile_element,
     linearize_element,
     record,
     replay,
@@ -50,7 +49,7 @@ from layerjax.transport.adding_doubling.proposals import (
     propose,
     propose_layered,
 )
-from layerjax.transport.adding_doubling.requested_directions import RequestedValues, read_requested, requested_values
+from layerjax.transport.adding_doubling.requested_directions import RequestedValues, read_requested
 from layerjax.transport.adding_doubling.resolution import (
     ASSUMED_WIDTH,
     ORDINATES,
@@ -62,18 +61,21 @@ from layerjax.transport.adding_doubling.resolution import (
     resolutions,
     shortage,
 )
+from layerjax.transport.adding_doubling.solutions import (
+    requested_values_of,
+    solve_requested,
+    solve_tables,
+    tables_of,
+)
 from layerjax.transport.adding_doubling.solve import (
-    Layers,
     Plan,
-    assemble,
     can_be_split,
     make_elements,
     make_plan,
     ranks,
     requested_stack,
-    without_base,
 )
-from layerjax.transport.adding_doubling.tables import Tables, make_tables, read_energies, read_rest
+from layerjax.transport.adding_doubling.tables import Tables, read_energies, read_rest
 from layerjax.transport.contract import DeterministicTransport, Side, refuse_interface_film, require_ggx
 from layerjax.transport.first_order import (
     FirstOrder,
@@ -81,7 +83,6 @@ from layerjax.transport.first_order import (
     evaluate_first,
     first_order,
     interaction_probability,
-    peak_probability,
 )
 from layerjax.transport.known_directions import DirectionLookup, KnownDirections, known_directions
 from layerjax.transport.single_scattering import SingleScattering
@@ -90,8 +91,6 @@ from layerjax.transport.specular import (
     has_specular,
     is_smooth,
     sample_with_deltas,
-    smooth_turns,
-    smooth_window,
     specular_draws,
 )
 
@@ -407,16 +406,10 @@ class AddingDoubling(DeterministicTransport):
     def _solve(
         self, stack: Stack, first: FirstOrder | SmoothOrder, once: FirstOrder | SmoothOrder | None, plan: Plan
     ) -> Tables:
-        if not _is_split(stack, first, once):
-            return _solve_at_once(stack, first, once, plan)
-        elements = make_elements(stack, plan, None, compile_element)
-        return _tables_of_elements(without_base(stack), elements, first, once, plan)
+        return solve_tables(stack, first, once, plan)
 
     def _solve_requested(self, stack: Stack, known: KnownDirections, plan: Plan) -> RequestedValues:
-        if not _is_split(stack, known):
-            return _solve_requested_at_once(stack, known, plan)
-        elements = make_elements(stack, plan, known, compile_element)
-        return _requested_values_of_elements(without_base(stack), elements, known, plan)
+        return solve_requested(stack, known, plan)
 
     def _with_resolution(self, resolution: Resolution) -> "AddingDoubling":
         return dataclasses.replace(self, **resolution._asdict(), tolerance=None)
@@ -492,12 +485,12 @@ class _TraceableAddingDoubling(AddingDoubling):
     ) -> Tables:
         if self.elements is None:
             return super()._solve(stack, first, once, plan)
-        return _tables(stack, make_elements(stack, plan, None, replay(self.elements)), first, once, plan)
+        return tables_of(stack, make_elements(stack, plan, None, replay(self.elements)), first, once, plan)
 
     def _solve_requested(self, stack: Stack, known: KnownDirections, plan: Plan) -> RequestedValues:
         if self.elements is None:
             return super()._solve_requested(stack, known, plan)
-        return _requested_values(stack, make_elements(stack, plan, known, replay(self.elements)), known, plan)
+        return requested_values_of(stack, make_elements(stack, plan, known, replay(self.elements)), known, plan)
 
 
 @filter_jit
@@ -543,68 +536,6 @@ def _scale_stack(stack: Stack, plan: Plan) -> tuple[Stack, FirstOrder | SmoothOr
         return carried, once
     media = once.upper.media if once.lower is None else once.upper.media + once.lower.media
     return carried, once if media else None
-
-
-def _is_split(stack: Stack, *inputs: Any) -> bool:
-    """Whether elements have programs of their own, which the next stack finds compiled."""
-    return can_be_split(stack) and is_outermost(stack, inputs)
-
-
-@filter_jit
-@exact_products
-def _solve_at_once(
-    stack: Stack, first: FirstOrder | SmoothOrder, once: FirstOrder | SmoothOrder | None, plan: Plan
-) -> Tables:
-    return _tables(stack, make_elements(stack, plan, None), first, once, plan)
-
-
-@filter_jit
-@exact_products
-def _solve_requested_at_once(stack: Stack, known: KnownDirections, plan: Plan) -> RequestedValues:
-    return _requested_values(stack, make_elements(stack, plan, known), known, plan)
-
-
-@filter_jit
-@exact_products
-def _tables_of_elements(
-    layers: Layers,
-    elements: list[Any],
-    first: FirstOrder | SmoothOrder,
-    once: FirstOrder | SmoothOrder | None,
-    plan: Plan,
-) -> Tables:
-    return _tables(layers.stack(), elements, first, once, plan)
-
-
-@filter_jit
-@exact_products
-def _requested_values_of_elements(
-    layers: Layers, elements: list[Any], known: KnownDirections, plan: Plan
-) -> RequestedValues:
-    return _requested_values(layers.stack(), elements, known, plan)
-
-
-def _tables(
-    stack: Stack,
-    elements: list[Any],
-    first: FirstOrder | SmoothOrder,
-    once: FirstOrder | SmoothOrder | None,
-    plan: Plan,
-) -> Tables:
-    grid, whole, rest, faces = assemble(stack, plan, elements)
-    met = partial(interaction_probability, first)
-    onward = None if once is None else partial(peak_probability, first, once)
-    outer = faces if first.layered else None
-    windows = smooth_window(stack, upward=False), smooth_window(stack, upward=True)
-    above, below = (smooth_turns(stack, upward=up) if plan.azimuths is None else None for up in (False, True))
-    return make_tables(
-        grid, whole, rest, plan.azimuths, stack.base is not None, met, outer, onward, windows, (above, below)
-    )
-
-
-def _requested_values(stack: Stack, elements: list[Any], known: KnownDirections, plan: Plan) -> RequestedValues:
-    grid, _, rest, _ = assemble(stack, plan, elements)
-    return requested_values(rest, known, grid.regions[-1].ior, stack.base is not None)
 
 
 def _probes(opaque: bool, known: KnownDirections | None) -> tuple[Array, Array]:
