@@ -26,9 +26,7 @@ from layerjax.normals.facets import Distribution, Facets, check_facets
 from layerjax.normals.widths import azimuth_of_tangent
 from layerjax.phase import HenyeyGreenstein, PhaseFunction
 from layerjax.surfaces import Conductor, Surface, ThinFilm
-
-MATCHED = 64.0 * float(np.finfo(np.float32).eps)
-"""Relative difference of indices up to which light may pass unrefracted (see `surfaces.interface.is_index_matched`)."""
+from layerjax.surfaces.interface import MATCHED
 
 LEAST_EXTINCTION = 1e-10
 """In 1/mm, stands for 0 where derivatives by the coefficients of a turbid medium may be needed."""
@@ -286,7 +284,7 @@ def _refuse_delta_of_facets(name: str, face: Interface, above: Any) -> None:
     if any(isinstance(ior, jax.core.Tracer) or is_placeholder(ior) for ior in (face.ior, above)):
         return
     below, above = np.broadcast_arrays(np.asarray(face.ior), np.asarray(above))
-    matched = np.abs(below / above - 1.0) <= MATCHED
+    matched = np.abs(below / above - 1.0) <= MATCHED * np.finfo(np.float32).eps  # of either precision
     if np.any(matched):
         raise ValueError(
             f"{name}.ior: {below[matched][0]:g} is the index above it, and its facets have a film: what they pass is a "

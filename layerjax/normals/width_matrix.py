@@ -15,8 +15,8 @@ from layerjax.directions import Vector, normalize
 from layerjax.normals.ggx import ggx_sample
 from layerjax.normals.widths import Widths
 
-LEAST_SQUARE = 1e-8
-"""Square of the least width."""
+LEAST_WIDTH = 1e-4
+"""The narrowest lobe that is evaluated."""
 
 
 class WidthMatrix(eqx.Module):
@@ -39,7 +39,7 @@ class WidthMatrix(eqx.Module):
     @property
     def mean_width(self) -> Array:
         """Root of `mean_square`."""
-        return safe_sqrt(clamp_min(self.mean_square, LEAST_SQUARE))
+        return safe_sqrt(clamp_min(self.mean_square, LEAST_WIDTH**2))
 
     def width_seen(self, x: Array, y: Array) -> Array:
         """Width of isotropic facets that mask light about as much, from the components of its direction in the plane.
@@ -49,7 +49,7 @@ class WidthMatrix(eqx.Module):
         half_difference = 0.5 * (self.xx * self.xx - self.yy * self.yy)
         mixed = self.xy * (self.xx + self.yy)
         square = self.mean_square + half_difference * (x * x - y * y) + 2.0 * mixed * x * y
-        return jnp.sqrt(clamp_min(square, LEAST_SQUARE))
+        return jnp.sqrt(clamp_min(square, LEAST_WIDTH**2))
 
 
 def isotropic(alpha: Array) -> WidthMatrix:

@@ -17,6 +17,9 @@ from layerjax.normals.widths import StudentWidth, Width, Widths
 from layerjax.surfaces.microfacet import mirror_lobe, visibility
 from layerjax.surfaces.thin_film import BARE, Films
 
+MATCHED = 64.0
+"""Times the rounding of a ratio of indices: its difference from 1 up to which light passes unrefracted."""
+
 
 def interface_reflection(wi: Vector, wo: Vector, ior: Array, alpha: Width, distribution: Distribution = "ggx") -> Array:
     """BRDF of a rough dielectric interface, 1/sr, without the cosine (Walter 2007, Eq. 20).
@@ -119,7 +122,7 @@ def continued_lobe(
 
 def is_index_matched(ior: Array) -> Array:
     """Whether the indices are so nearly equal that light passes unrefracted, and the BTDF is a delta."""
-    return jnp.abs(ior - 1.0) <= 64.0 * jnp.finfo(jnp.result_type(ior)).eps
+    return jnp.abs(ior - 1.0) <= MATCHED * jnp.finfo(jnp.result_type(ior)).eps
 
 
 def interface_sample(

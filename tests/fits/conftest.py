@@ -20,7 +20,7 @@ def coat_toml(tmp_path_factory):
 @pytest.fixture(scope="session")
 def coat_data():
     """Noisy slices of that stack with known parameters; the last ten measurements are masked."""
-    data = coats.readings("coated")
+    data = coats.measurements("coated")
     return data.where(np.arange(len(data)) < len(data) - 10, "the last ten readings are left out")
 
 

@@ -1,4 +1,4 @@
-"""A folder of simulated readings of two materials, and the stack files that made them."""
+"""A folder of simulated measurements of two materials, and the stack files that made them."""
 
 from pathlib import Path
 
@@ -27,7 +27,7 @@ MATERIALS = {
 }
 
 
-def readings(name: str) -> Measurements:
+def measurements(name: str) -> Measurements:
     """Simulated slices of a material, with noise."""
     view = slices(incidence=(10, 50), azimuth=(0, 60))
     return simulate(MATERIALS[name], view, transport=lj.SingleScattering(), noise=0.03, seed=1)
@@ -38,7 +38,7 @@ def make_folder(folder: Path) -> None:
     scans = folder / "scans"
     scans.mkdir()
     for name in MATERIALS:
-        write_csv(readings(name), scans / f"{name}.csv")
+        write_csv(measurements(name), scans / f"{name}.csv")
     (scans / "broken.csv").write_text("theta_i,phi_i,theta_o,phi_o,brdf\n10,180,twenty,0,0.1\n")
     (scans / "README.md").write_text("Readings of two samples.\n")
     for name, text in STACKS.items():

@@ -120,7 +120,10 @@ def _as_matrix(width: LobeWidth) -> WidthMatrix:
 def microfacet_lobes(
     stack: Stack, options: Options, cosine: Array, upward: bool, plane: Plane | None = None
 ) -> MicrofacetLobes:
-    """Lobes of a simplified stack, lit from above, or from below (`upward`). Diffuse bases are omitted."""
+    """Lobes of a simplified stack, lit from above, or from below (`upward`). Diffuse bases are omitted.
+
+    plane: of the direction of the light outside, where facets have two widths; see `width_seen`.
+    """
     cosine = clamp_min(cosine, GRAZING)
     found = statistics(stack, cosine, options, upward, plane)
     reflected, facet = _reflected_lobes(found, cosine)

@@ -18,7 +18,7 @@ from layerjax._numerics import clamp_max, clamp_min, unstack
 from layerjax.channels import Channels, map_channels, per_channel
 from layerjax.microsurface.directional_albedo import is_narrowest
 from layerjax.microsurface.energy_tables import conductor_energies, escape_cone_share, interface_energies
-from layerjax.normals.width_matrix import WidthMatrix, width_matrix
+from layerjax.normals.width_matrix import LEAST_WIDTH, WidthMatrix, width_matrix
 from layerjax.normals.widths import Widths
 from layerjax.stack import Interface, Medium, Stack, is_known
 from layerjax.surfaces import Conductor
@@ -184,7 +184,10 @@ def parts(stack: Stack, upward: bool, smooth: tuple[bool, ...] | None = None) ->
 def statistics(
     stack: Stack, cosine: Array, options: Options, upward: bool = False, plane: Plane | None = None
 ) -> Statistics:
-    """Lobes of a simplified stack, lit along cosines > 0, from below if `upward`. Diffuse bases are omitted."""
+    """Lobes of a simplified stack, lit along cosines > 0, from below if `upward`. Diffuse bases are omitted.
+
+    plane: of the direction of the light outside, see `width_seen`.
+    """
     met = parts(stack, upward, options.smooth)
     above = identity(cosine)
     reflected: list[Reflection] = []
@@ -340,4 +343,4 @@ def lobe_roughness(sigma: Array) -> Array:
 
 def bound_alpha(alpha: Array) -> Array:
     """A GGX width kept within the range that lobes are evaluated in."""
-    return clamp_max(clamp_min(alpha, 1e-4), 1.0)
+    return clamp_max(clamp_min(alpha, LEAST_WIDTH), 1.0)

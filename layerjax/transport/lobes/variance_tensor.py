@@ -11,12 +11,9 @@ import jax.numpy as jnp
 from jax import Array
 
 from layerjax._numerics import clamp_max, clamp_min
-from layerjax.normals.width_matrix import WidthMatrix, rotate
+from layerjax.normals.width_matrix import LEAST_WIDTH, WidthMatrix, rotate
 from layerjax.normals.widths import Widths
 from layerjax.transport.lobes.variance import EXPONENT, NARROWEST, variance
-
-LEAST_WIDTH = 1e-4
-"""The narrowest lobe that is evaluated."""
 
 SPLIT = {32: 5e-3, 64: 6e-6}
 """Least relative distance of eigenvalues that a quotient of differences is formed with, by bits: cube roots of the

@@ -135,7 +135,7 @@ def test_errors_count_in_fitted_noise_levels_or_the_scatter_about_a_named_object
     np.testing.assert_allclose(spread(named, TRUTH, data.values), least)
 
 
-def readings(wave):
+def with_wave(wave):
     """Of the line, times one plus a wave along the viewing angle, with noise of 2 %."""
     angle = np.arctan2(SCANS.wo[:, :1], SCANS.wo[:, 2:])
     noise = 0.02 * np.random.default_rng(0).standard_normal(EXACT.shape)
@@ -143,7 +143,7 @@ def readings(wave):
 
 
 def fitted(wave=0.1, noise=NOISE, starts=2, **how):
-    return fit(POSITIVE_LINE, readings(wave), transport=line, noise=noise, starts=starts, **how)
+    return fit(POSITIVE_LINE, with_wave(wave), transport=line, noise=noise, starts=starts, **how)
 
 
 @pytest.fixture(scope="module")
