@@ -7,6 +7,7 @@ that a gradient holds no more than one chunk in memory and accumulates as it goe
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache, partial
 from typing import Any, Literal, get_args
 
@@ -43,6 +44,7 @@ from layerjax.transport.known_directions import (
     MOST_COSINES,
     DirectionLookup,
     KnownDirections,
+    KnownPairs,
     known_above,
     known_directions,
     separate_cosines,
@@ -92,12 +94,14 @@ def evaluate_known(
     side: Side = "all",
     key: Array | None = None,
     known: KnownDirections | None = None,
+    pairs: KnownPairs | None = None,
 ) -> Array:
     """`evaluate` where the directions may be traced, and what they are is known all the same.
 
-    Not public: `known` must be what `known_directions` says of just these directions, which cannot be checked where
-    they are traced; of others the values would be wrong. The cosines are taken from it, so that derivatives by them are
-    not complete. Concrete directions are looked at here, and maps look for themselves.
+    Not public: `known` must be what `known_directions` says of just these directions, or `pairs` what `known_pairs`
+    does, which cannot be checked where they are traced; of others the values would be wrong. The cosines are taken from
+    them, so that derivatives by them are not complete. Concrete directions are looked at here, and maps look for
+    themselves.
     """
     require_choice("side", side, get_args(Side))
     wi, wo = read_directions(wi=wi, wo=wo)
@@ -108,7 +112,10 @@ def evaluate_known(
         )
     if isinstance(stack, Mixture):
         return _broadcast_parts(stack).mean(
-            lambda part, subkey: evaluate_known(part, wi, wo, transport, side=side, key=subkey, known=known), key
+            lambda part, subkey: evaluate_known(
+                part, wi, wo, transport, side=side, key=subkey, known=known, pairs=pairs
+            ),
+            key,
         )
     shape = _shape_of(stack)
     if shape:
@@ -128,6 +135,9 @@ def evaluate_known(
                     _evaluate_whole, (simplified, traced, *more), (simplified, chosen, *more)
                 )
     prepared = ensure_prepared(stack, transport, wi.dtype, looked)
+    if pairs is not None:
+        state = prepared.transport.with_known_pairs(prepared.state, cast_arrays(pairs, wi.dtype))
+        prepared = replace(prepared, state=state)
     return _evaluate(prepared, wi, wo, side, prepared.transport.resolve_key(key, "evaluate"))[0]
 
 

@@ -34,7 +34,7 @@ from fits.problem.noise import (
 from fits.problem.parameters import Box, Template, with_values
 from layerjax._shapes import require_single
 from layerjax.evaluate import evaluate_known
-from layerjax.transport.known_directions import KnownDirections
+from layerjax.transport.known_directions import KnownDirections, KnownPairs
 
 Transport = lj.Transport | Literal["auto"] | Callable[[Any, Array, Array], Array]
 """How the values are computed: a layerjax transport, `"auto"`, or any callable in the place of one.
@@ -99,7 +99,7 @@ class Model(eqx.Module):
     least_floor: Array
     degrees_of_freedom: Array
     transport: Transport
-    known: KnownDirections | None
+    known: KnownDirections | KnownPairs | None
     optics: Optics | None
     process: Process | None
     softness: Array | None
@@ -170,7 +170,7 @@ class Model(eqx.Module):
             return self.stand_in.predict(self, vector)
         parts = self.build(vector)
 
-        def values(wi: Array, wo: Array, known: KnownDirections | None) -> Array:
+        def values(wi: Array, wo: Array, known: KnownDirections | KnownPairs | None) -> Array:
             return forward(parts.stack, wi, wo, self.transport, self.side, known)
 
         if self.optics is None:
@@ -414,7 +414,7 @@ def forward(
     wo: Array | NDArray[np.float64],
     transport: Transport,
     side: Side = "all",
-    known: KnownDirections | None = None,
+    known: KnownDirections | KnownPairs | None = None,
 ) -> Array:
     """BSDF (N, C) in 1/sr along unit directions (N, 3): the one place where inference meets the forward models.
 
@@ -426,4 +426,6 @@ def forward(
     if callable(transport) and not isinstance(transport, lj.Transport | type):  # layerjax refuses classes
         return transport(stack, jnp.asarray(wi), jnp.asarray(wo))
     require_single(stack, "inference")
+    if isinstance(known, KnownPairs):
+        return evaluate_known(stack, wi, wo, transport, side=side, pairs=known)
     return evaluate_known(stack, wi, wo, transport, side=side, known=known)

@@ -39,7 +39,7 @@ from layerjax._parameters import plain_name
 from layerjax._shapes import channel_count
 from layerjax.mixture import require_material
 from layerjax.stack import make_constants_static
-from layerjax.transport.known_directions import known_directions
+from layerjax.transport.known_directions import KnownDirections, KnownPairs, known_directions, known_pairs
 
 # of parameters by how their names end; all others are plain ratios
 UNITS = {
@@ -477,16 +477,21 @@ def _parameter_name(path: str) -> str:
 def _directions(problem: Problem, wi: Floats, wo: Floats, other_rays: bool = False) -> dict[str, Any]:
     """What a model holds of measurements along these directions, (N, 3) each; other_rays: see `optics_of`."""
     transport, optics = problem.transport, None
+    known: KnownDirections | KnownPairs | None = None
     # where known directions are of no use, programs should not depend on how many there are
     follow = transport == "auto" or (isinstance(transport, lj.Transport) and transport.uses_known_directions)
     follow = follow and not isinstance(problem.data, Totals)  # whose light leaves along all directions
     if problem.instrument is not None:
         incidences = polar_angles(problem.data)
         optics = optics_of(problem.instrument, problem.stack, wi, wo, incidences, follow, other_rays)
+    elif follow:
+        known = known_directions(wi, wo)
+    elif isinstance(transport, lj.Transport) and transport.uses_known_pairs:
+        known = known_pairs(wi, wo)
     return {
         "wi": jnp.asarray(wi),
         "wo": jnp.asarray(wo),
-        "known": known_directions(wi, wo) if follow and optics is None else None,
+        "known": known,
         "optics": optics,
         "side": "reflection" if np.all(wi[:, 2] > 0) and np.all(wo[:, 2] > 0) else "all",
     }

@@ -21,7 +21,7 @@ from layerjax.channels import Channels, pick
 from layerjax.directions import UNIT_SLACK, Vector, dot, horizontal, select, split
 from layerjax.stack import Interface, Stack
 from layerjax.surfaces import Conductor
-from layerjax.transport.known_directions import DirectionLookup
+from layerjax.transport.known_directions import DirectionLookup, KnownPairs
 
 Side = Literal["all", "reflection", "transmission"]
 """Requested pairs: any; both directions above; one above and one below. Others give 0."""
@@ -62,6 +62,9 @@ class Transport(eqx.Module):
     uses_known_directions: ClassVar[bool] = False
     """Whether `prepare_for_directions` makes use of known directions."""
 
+    uses_known_pairs: ClassVar[bool] = False
+    """Whether `with_known_pairs` makes use of them."""
+
     texel_batch: ClassVar[int] = 1
     """How many texels of a map of stacks are computed together; `TEXELS` for stacks of a few numbers."""
 
@@ -91,6 +94,10 @@ class Transport(eqx.Module):
     def prepare_for_directions(self, stack: Stack, known: DirectionLookup) -> Any:
         """Like `prepare`, for values at known directions only."""
         return self.prepare(stack)
+
+    def with_known_pairs(self, state: Any, pairs: KnownPairs) -> Any:
+        """What `prepare` returned, for values of just these pairs of directions."""
+        return state
 
     def traceable_equivalent(self, stack: Stack, known: DirectionLookup) -> "Transport | None":
         """A transport with the same values, and with forward derivatives, inside a program where all parameters of the

@@ -21,6 +21,12 @@ MOST_COSINES = 256
 MOST_PAIRS = 20_000
 """Larger batches are not looked at."""
 
+MOST_PAIRS_AT_ONCE = 4_000
+"""Pairs that are evaluated together, not in chunks."""
+
+ROUNDED = 64
+"""Cosines that differ by less, in units of the rounding of 1, count as one."""
+
 STAND_IN = 0.5
 """For directions in the tangent plane, whose values are 0, and for a side without directions."""
 
@@ -38,6 +44,16 @@ class KnownDirections(eqx.Module):
     wi_index: Array
     wo_index: Array
     all_above: bool = eqx.field(static=True, default=False)
+
+
+class KnownPairs(eqx.Module):
+    """The distinct angles between light and half vector among the pairs of a batch.
+
+    cosines: of these angles, (cosines,). index: for every pair the place of its own, in the shape of the batch.
+    """
+
+    cosines: Array
+    index: Array
 
 
 DirectionLookup = Callable[[], KnownDirections | None]
@@ -65,6 +81,23 @@ def known_directions(wi: Any, wo: Any) -> KnownDirections | None:
     wi_index, wo_index = places[:split].reshape(cosines[0].shape), places[split:].reshape(cosines[1].shape)
     above, below, i, o = map(jnp.asarray, (*sides, wi_index, wo_index))
     return KnownDirections(above, below, i, o, all_above=bool(np.all(z > 0)))
+
+
+def known_pairs(wi: np.ndarray, wo: np.ndarray) -> KnownPairs | None:
+    """What is known of pairs of directions (n, 3) each above the tangent plane; None where it does not pay.
+
+    In scans in a plane with even steps many pairs have the same angle. Cosines that differ by rounding count as one.
+    """
+    if len(wi) > MOST_PAIRS_AT_ONCE or not len(wi) or min(wi[:, 2].min(), wo[:, 2].min()) <= 0.0:
+        return None
+    dtype = jnp.result_type(float)
+    cosines = np.sqrt(np.maximum(0.5 + 0.5 * np.sum(wi * wo, axis=-1, dtype=np.float64), 0.0))
+    _, first, index = np.unique(
+        np.round(cosines / (ROUNDED * jnp.finfo(dtype).eps)), return_index=True, return_inverse=True
+    )
+    if 2 * first.size > len(wi):
+        return None
+    return KnownPairs(jnp.asarray(cosines[first], dtype), jnp.asarray(index.reshape(len(wi)), np.int32))
 
 
 def known_above(*directions: Any) -> bool:

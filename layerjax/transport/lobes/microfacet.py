@@ -86,6 +86,21 @@ class MicrofacetLobes(NamedTuple):
         )
         return self._replace(reflected=reflected, transmitted=transmitted)
 
+    def at(self, index: Array) -> "MicrofacetLobes":
+        """The reflected lobes for light along many directions, of cosines at these places, (n,).
+
+        As products with a matrix of 0 and 1: XLA would compute the lobes again for each number that is gathered.
+        """
+
+        def spread(row: Array) -> Array:
+            return row @ (jnp.arange(row.size)[:, None] == index).astype(row.dtype)
+
+        def of(lobe: MicrofacetLobe) -> MicrofacetLobe:
+            energy, scale, alpha = jax.tree.map(spread, (lobe.energy, lobe.scale, lobe.alpha))
+            return MicrofacetLobe(energy, scale, alpha, lobe.specular)
+
+        return MicrofacetLobes(tuple(map(of, self.reflected)), (), self.facet)
+
     def energies(self, dark: Array) -> tuple[Channels, Channels]:
         """Energies of all lobes on the side of the light and on the other, added to zeros."""
         lobes = self.reflected, self.transmitted

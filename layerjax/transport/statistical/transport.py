@@ -7,7 +7,7 @@ follow from adding. Over a diffuse base the light that has reached it leaves as 
 import dataclasses
 from collections.abc import Sequence
 from functools import partial
-from typing import Any, Literal, get_args
+from typing import Any, ClassVar, Literal, get_args
 
 import equinox as eqx
 import jax
@@ -30,7 +30,7 @@ from layerjax.stack import Interface, Medium, Stack
 from layerjax.surfaces import Conductor, Surface
 from layerjax.surfaces.interface import interface_reflection
 from layerjax.transport.contract import TEXELS, DeterministicTransport, Side, refuse_film, refuse_other_normals
-from layerjax.transport.known_directions import DirectionLookup
+from layerjax.transport.known_directions import DirectionLookup, KnownPairs
 from layerjax.transport.lobes.microfacet import (
     Facet,
     LobeWidth,
@@ -70,13 +70,17 @@ Energies = tuple[Channels, Channels]
 
 
 class StatisticalState(eqx.Module):
-    """A stack, the diffuse part of its light, and the indices below it and of where transmitted lobes are described."""
+    """A stack, the diffuse part of its light, and the indices below it and of where transmitted lobes are described.
+
+    pairs: of the directions that alone are evaluated, if they are known.
+    """
 
     stack: Stack
     diffuse: DiffusePart | None
     below: Array
     reference: Array
     smooth: tuple[bool, ...] = eqx.field(static=True)
+    pairs: KnownPairs | None = None
 
     @property
     def is_open(self) -> bool:
@@ -131,6 +135,8 @@ class Statistical(DeterministicTransport):
         ValueError: an option has an unknown value.
     """
 
+    uses_known_pairs: ClassVar[bool] = True
+
     symmetric: bool = eqx.field(static=True, default=True)
     facet_multiple_scattering: bool = eqx.field(static=True, default=True)
     scattering: Scattering = eqx.field(static=True, default="orders")
@@ -178,6 +184,9 @@ class Statistical(DeterministicTransport):
             else:
                 diffuse = _closed_form(with_one_width(stack))
         return StatisticalState(stack, diffuse, index_below(stack), reference_index(stack), smooth_parts(stack))
+
+    def with_known_pairs(self, state: StatisticalState, pairs: KnownPairs) -> StatisticalState:
+        return dataclasses.replace(state, pairs=pairs) if self.symmetric and not state.is_anisotropic else state
 
     def traceable_equivalent(self, stack: Stack, known: DirectionLookup) -> "Statistical | None":
         """Itself, but where alphas are known to be as narrow as can be, which are traced as any others would be."""
@@ -280,7 +289,9 @@ class Statistical(DeterministicTransport):
         valid = (wi[2] > edge) & (wo[2] > edge)
         wi, wo = sanitise(wi, valid), sanitise(wo, valid)
         h, cosine = half_vector(wi, wo, same_side=True)
-        if self.symmetric:
+        if state.pairs is not None:  # many pairs have the same lobes
+            found = self._microfacet_lobes(state, state.pairs.cosines, upward, None).at(state.pairs.index)
+        elif self.symmetric:
             found = self._microfacet_lobes(state, cosine, upward, _common_plane(state, wi, wo, 1.0))
         else:
             found = self._microfacet_lobes(state, wi[2], upward, _plane(state, wi))
