@@ -111,10 +111,8 @@ def assemble(
     grid = _grid(plan, _indices(stack, dtype), dtype)
     solved: list[tuple[Layer, bool]] = []
     for layer, found in zip((*stack.layers, stack.base), elements, strict=False):
-        if isinstance(layer, Medium):
-            solved.append((medium_layer(layer, found), plan.azimuths is not None and is_tilted(layer)))
-        else:
-            solved.append((found, _is_expanded(found, grid)))
+        tilted = plan.azimuths is not None and is_tilted(layer)
+        solved.append((medium_layer(layer, found) if isinstance(layer, Medium) else found, tilted))
     whole, is_expanded = solved[-1]
     for found, tilted in reversed(solved[:-1]):
         if tilted and not is_expanded:
@@ -122,12 +120,6 @@ def assemble(
         whole = add(expand_modes(found, plan.azimuths) if is_expanded and not tilted else found, whole)
     layers = [found for found, _ in solved]
     return grid, whole, subtract_ballistic(stack, layers, whole), outer_faces(stack, layers)
-
-
-def _is_expanded(surface: Layer, grid: Grid) -> bool:
-    """Whether a surface is on ordinates by itself: its facets have two widths."""
-    reflected = surface.reflect_top.total
-    return reflected is not None and reflected.shape[-1] != grid.size
 
 
 def can_be_split(stack: Stack) -> bool:
