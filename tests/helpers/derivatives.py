@@ -16,6 +16,7 @@ FIBERS = Medium(0.7, 0.8, lj.SGGX("fiber", 0.3, (0.5, 0.3, 0.7)), 0.4)
 DYE = Medium(0.7, 0.0)
 METAL = Conductor(0.4, 2.0, 0.3)
 TINTED = Conductor(0.4, 2.0, 0.3, film=lj.ThinFilm(1.8, 150.0, 550.0))
+BRUSHED = Conductor(0.4, 2.0, 0.3, alpha_y=0.15, tangent=0.6)
 FACE = Interface(1.5, 0.3)
 VMF_FACE = Interface(1.5, 0.3, "vmf")
 
@@ -34,6 +35,7 @@ STACKS = {
     "metal, beckmann": Stack([], Conductor(0.4, 2.0, 0.3, "beckmann")),
     "metal, gtr": Stack([], Conductor(0.4, 2.0, 0.3, "gtr", gamma=3.0)),
     "metal, vmf": Stack([], Conductor(0.4, 2.0, 0.3, "vmf")),
+    "brushed metal": Stack([], BRUSHED),
     "tinted metal": Stack([], TINTED),
     "face": Stack([FACE]),
     "varnish": Stack([FACE], Lambertian(0.5)),
@@ -44,6 +46,8 @@ STACKS = {
     "varnish on flakes' transport": Stack([FACE], VMFDiffuse(0.5, 0.3, "all_orders")),
     "coated metal": Stack([FACE], METAL),
     "coated tinted metal": Stack([FACE], TINTED),
+    "coated brushed metal": Stack([FACE], BRUSHED),
+    "brushed varnish": Stack([Interface(1.5, 0.3, alpha_y=0.15)], Lambertian(0.5)),
     "coated metal, vmf": Stack([VMF_FACE], Conductor(0.4, 2.0, 0.3, "vmf")),
     "dyed varnish": Stack([FACE, DYE], Lambertian(0.5)),
     "dyed coat on metal": Stack([FACE, DYE], METAL),
@@ -155,7 +159,7 @@ def random_points(stack, fixed=None, count=17, ends=0.25):
             low, high = field.range
             if rng.random() < ends:
                 vector[field.place] = rng.choice([low, high, *(n for n in (0.0, 1.0) if low < n < high)])
-            elif field.key.endswith((".alpha", ".ior")):
+            elif field.key.endswith((".alpha", ".alpha_y", ".ior")):
                 vector[field.place] = np.exp(rng.uniform(np.log(low), np.log(high)))
             elif field.key.endswith(".thickness"):
                 vector[field.place] = 10.0 ** rng.uniform(-3.0, 2.0)
@@ -171,7 +175,13 @@ def random_points(stack, fixed=None, count=17, ends=0.25):
 def _length(field, value):
     if field == "g":
         return min(1.0 - abs(value), 0.5)
-    return max(abs(value), 1.0) if field in ("thickness", "k") else abs(value) if field in ("alpha", "ior") else 1.0
+    return (
+        max(abs(value), 1.0)
+        if field in ("thickness", "k")
+        else abs(value)
+        if field in ("alpha", "alpha_y", "ior")
+        else 1.0
+    )
 
 
 def vector_and_build(stack, fixed=None):

@@ -48,6 +48,7 @@ TIED = {("two coats on paint", "layers[1].alpha", 1.0)}
 
 JITTERY = {
     ("Statistical", "varnish"),
+    ("Statistical", "brushed varnish"),
     ("Statistical", "dyed varnish"),
     ("Statistical", "hazy varnish"),
     ("Statistical", "two coats on paint"),
@@ -211,7 +212,7 @@ def test_derivatives(name, kind):
     slopes = slopes_of(stack, build, TRANSPORTS[name])
     faces = [layer for layer in stack.layers if isinstance(layer, lj.Interface)]
     comparable = not (faces and name.startswith(ILL_CONDITIONED))
-    widths = [field.place for field in fields_of(stack, fixed) if field.path.endswith("alpha")]
+    widths = [field.place for field in fields_of(stack, fixed) if field.path.endswith(("alpha", "alpha_y"))]
     points = [(start.at[point.place].set(point.value), point) for point in points_of(stack, fixed)]
     points = [(vector, point) for vector, point in points if is_carried(TRANSPORTS[name], build(vector))]
     drawn = list(random_points(stack, fixed)) if name in RANDOMLY else []
