@@ -128,20 +128,24 @@ def can_be_split(stack: Stack) -> bool:
 
 
 class Layers(eqx.Module):
-    """All that `assemble` needs of a stack: the layers, and whether there is a base."""
+    """All that `assemble` needs of a stack: the layers, whether there is a base, and whether that is on ordinates."""
 
     layers: tuple[Interface | Medium, ...]
     opaque: bool = eqx.field(static=True)
+    tilted_base: bool = eqx.field(static=True)
     dtype: Any = eqx.field(static=True)
 
     def stack(self) -> Stack:
-        """A stack of these layers, over a base that stands for any."""
-        return Stack(self.layers, Lambertian(jnp.zeros((), self.dtype)) if self.opaque else None)
+        """A stack of these layers, over a base that stands for any of its symmetry."""
+        if not self.opaque:
+            return Stack(self.layers)
+        one = jnp.ones((), self.dtype)
+        return Stack(self.layers, Conductor(one, one, one, alpha_y=one) if self.tilted_base else Lambertian(one))
 
 
 def without_base(stack: Stack) -> Layers:
     """The stack without its base, so that programs do not depend on it."""
-    return Layers(stack.layers, stack.base is not None, _dtype(stack))
+    return Layers(stack.layers, stack.base is not None, is_tilted(stack.base), _dtype(stack))
 
 
 def _grid(plan: Plan, indices: Scalars, dtype: Any) -> Grid:
