@@ -478,15 +478,18 @@ def _directions(problem: Problem, wi: Floats, wo: Floats, other_rays: bool = Fal
     """What a model holds of measurements along these directions, (N, 3) each; other_rays: see `optics_of`."""
     transport, optics = problem.transport, None
     known: KnownDirections | KnownPairs | None = None
+    of_pairs = not isinstance(problem.data, Totals)  # whose light leaves along all directions
     # where known directions are of no use, programs should not depend on how many there are
-    follow = transport == "auto" or (isinstance(transport, lj.Transport) and transport.uses_known_directions)
-    follow = follow and not isinstance(problem.data, Totals)  # whose light leaves along all directions
+    follow = of_pairs and (
+        transport == "auto" or (isinstance(transport, lj.Transport) and transport.uses_known_directions)
+    )
+    pair = of_pairs and isinstance(transport, lj.Transport) and transport.uses_known_pairs
     if problem.instrument is not None:
         incidences = polar_angles(problem.data)
         optics = optics_of(problem.instrument, problem.stack, wi, wo, incidences, follow, other_rays)
     elif follow:
         known = known_directions(wi, wo)
-    elif isinstance(transport, lj.Transport) and transport.uses_known_pairs:
+    elif pair:
         known = known_pairs(wi, wo)
     return {
         "wi": jnp.asarray(wi),

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from layerjax._batching import CHUNK_BYTES
 from layerjax._numerics import clamp_max, horizon
 
 MOST_COSINES = 256
@@ -21,8 +22,8 @@ MOST_COSINES = 256
 MOST_PAIRS = 20_000
 """Larger batches are not looked at."""
 
-MOST_PAIRS_AT_ONCE = 4_000
-"""Pairs that are evaluated together, not in chunks."""
+MOST_PAIRS_AT_ONCE = 2 * CHUNK_BYTES // 8
+"""Pairs that `map_direction_chunks` evaluates together in either precision, so that places among them hold."""
 
 ROUNDED = 64
 """Cosines that differ by less, in units of the rounding of 1, count as one."""

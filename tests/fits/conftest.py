@@ -21,7 +21,7 @@ def coat_toml(tmp_path_factory):
 def coat_data():
     """Noisy slices of that stack with known parameters; the last ten measurements are masked."""
     data = coats.measurements("coated")
-    return data.where(np.arange(len(data)) < len(data) - 10, "the last ten readings are left out")
+    return data.where(np.arange(len(data)) < len(data) - 10, "the last ten measurements are masked")
 
 
 @pytest.fixture

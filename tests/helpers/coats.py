@@ -40,6 +40,6 @@ def make_folder(folder: Path) -> None:
     for name in MATERIALS:
         write_csv(measurements(name), scans / f"{name}.csv")
     (scans / "broken.csv").write_text("theta_i,phi_i,theta_o,phi_o,brdf\n10,180,twenty,0,0.1\n")
-    (scans / "README.md").write_text("Readings of two samples.\n")
+    (scans / "README.md").write_text("Measurements of two samples.\n")
     for name, text in STACKS.items():
         (folder / f"{name}.toml").write_text(text)

@@ -175,13 +175,9 @@ def random_points(stack, fixed=None, count=17, ends=0.25):
 def _length(field, value):
     if field == "g":
         return min(1.0 - abs(value), 0.5)
-    return (
-        max(abs(value), 1.0)
-        if field in ("thickness", "k")
-        else abs(value)
-        if field in ("alpha", "alpha_y", "ior")
-        else 1.0
-    )
+    if field in ("thickness", "k"):
+        return max(abs(value), 1.0)
+    return abs(value) if field in ("alpha", "alpha_y", "ior") else 1.0
 
 
 def vector_and_build(stack, fixed=None):

@@ -136,7 +136,7 @@ def test_errors_count_in_fitted_noise_levels_or_the_scatter_about_a_named_object
 
 
 def with_wave(wave):
-    """Of the line, times one plus a wave along the viewing angle, with noise of 2 %."""
+    """Measurements of the line, times one plus a wave along the viewing angle, with noise of 2 %."""
     angle = np.arctan2(SCANS.wo[:, :1], SCANS.wo[:, 2:])
     noise = 0.02 * np.random.default_rng(0).standard_normal(EXACT.shape)
     return along(SCANS, EXACT * (1.0 + wave * np.sin(8.0 * angle) + noise))
