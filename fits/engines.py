@@ -26,6 +26,17 @@ TIMEOUT = 60.0  # seconds to wait for the first worker
 
 FULL = (errno.ENOSPC, errno.EDQUOT)  # errors of a full disk, which affect every task
 
+LOCAL = {
+    "distributed.admin.tick.interval": "1s",
+    "distributed.worker.profile.enabled": False,
+    "distributed.scheduler.worker-saturation": 1.0,
+}
+"""Settings of a cluster on this machine: no statistics, which take a twentieth of every core, and no second task that
+waits in a worker, where a first that kills the worker would count against it."""
+
+MOST_TOGETHER, TURNS = 8, 8
+"""Short tasks that are sent at once, at most, and how often each worker comes round at least."""
+
 Work = Callable[[Any, Any], Any]
 
 
@@ -43,6 +54,7 @@ def run(
     processes: int = 1,
     client: Any = None,
     threads: int | None = None,
+    short: bool = False,
 ) -> Iterator[tuple[int, Any]]:
     """Execute all tasks; yields the index and result of each as it finishes.
 
@@ -52,6 +64,7 @@ def run(
         tasks: any number of them.
         processes, client: see `connected`; without either, threads of this process.
         threads: so many; None: one a core. With 1 the calling thread executes the tasks.
+        short: whether tasks take less than a second. Several of many are then sent to a worker at once.
 
     Yields:
         (index, result): a `Failure` if `work` raised ValueError or OSError, or its worker died four times. A full disk,
@@ -64,7 +77,7 @@ def run(
             # threads of JAX run beside each other, for they leave Python while they compute
             yield from as_finished(partial(attempt, work, shared), tasks, threads)
         else:
-            yield from _run_cluster(work, shared, list(tasks), connection)
+            yield from _run_cluster(work, shared, list(tasks), connection, short)
 
 
 @contextmanager
@@ -112,18 +125,20 @@ def connected(client: Any, processes: int = 1) -> Iterator[Any]:
 @contextmanager
 def local_cluster(processes: int) -> Iterator[Any]:
     """A client of so many processes of this machine with one thread each."""
+    from dask import config
     from distributed import Client, LocalCluster
 
     try:
-        cluster = LocalCluster(
-            n_workers=processes,
-            threads_per_worker=1,
-            memory_limit=0,
-            dashboard_address=":0",
-            silence_logs=logging.CRITICAL,  # of workers that are killed and started again
-            env=environment(),
-            preload=__name__,
-        )
+        with config.set(LOCAL):
+            cluster = LocalCluster(
+                n_workers=processes,
+                threads_per_worker=1,
+                memory_limit=0,
+                dashboard_address=":0",
+                silence_logs=logging.CRITICAL,  # of workers that are killed and started again
+                env=environment(),
+                preload=__name__,
+            )
     except Exception as error:  # its kind differs between versions
         guard = 'something ends them, or a script has no `if __name__ == "__main__":` around its statements'
         raise ValueError(f"worker processes cannot start ({one_line(error)}): {guard}") from None
@@ -154,7 +169,7 @@ def one_line(error: BaseException) -> str:
 # ---- the workers of a cluster ----
 
 
-def _run_cluster(work: Work, shared: Any, tasks: list[Any], client: Any) -> Iterator[tuple[int, Any]]:
+def _run_cluster(work: Work, shared: Any, tasks: list[Any], client: Any, short: bool) -> Iterator[tuple[int, Any]]:
     """A worker takes one task at a time: for several, workers with several threads use a process."""
     import cloudpickle
     from distributed import KilledWorker, as_completed
@@ -165,7 +180,7 @@ def _run_cluster(work: Work, shared: Any, tasks: list[Any], client: Any) -> Iter
         raise ValueError(f"what tasks need cannot be pickled for the workers: {one_line(error)}") from None
     if not tasks:
         return
-    address, submitted = str(getattr(client.scheduler, "address", "the cluster")), dict[Any, int]()
+    address, submitted = str(getattr(client.scheduler, "address", "the cluster")), dict[Any, range]()
 
     def require_scheduler() -> None:
         if client.status != "running":
@@ -180,19 +195,23 @@ def _run_cluster(work: Work, shared: Any, tasks: list[Any], client: Any) -> Iter
             with client.as_current():
                 sent.result(timeout=TIMEOUT)
                 client.replicate([sent])  # a scheduler prefers workers that hold the data
-            for index, task in enumerate(pickled):
-                submitted[client.submit(perform, sent, task, precision(), pure=False)] = index
+            together = max(1, min(MOST_TOGETHER, len(tasks) // (TURNS * len(client.nthreads())))) if short else 1
+            for at in range(0, len(tasks), together):
+                group = range(at, min(at + together, len(tasks)))
+                future = client.submit(perform, sent, pickled[at : at + together], precision(), pure=False)
+                submitted[future] = group
         for future in as_completed(list(submitted), loop=client.loop):
-            index = submitted.pop(future)
+            group = submitted.pop(future)
             try:
-                result = future.result()
+                results = future.result()
             except KilledWorker as killed:
-                result = Failure(f"its worker died {getattr(killed, 'allowed_failures', 3) + 1} times")
+                words = f"its worker died {getattr(killed, 'allowed_failures', 3) + 1} times"
+                results = [Failure(words)] * len(group)
             except (futures.CancelledError, asyncio.CancelledError):
                 require_scheduler()
-                result = Failure("the scheduler has cancelled it")
+                results = [Failure("the scheduler has cancelled it")] * len(group)
             future.release()
-            yield index, result
+            yield from zip(group, results, strict=True)
     except TimeoutError:
         raise OSError(f"{address}: no worker came within {TIMEOUT:g} s") from None
     except (OSError, RuntimeError):
@@ -203,11 +222,11 @@ def _run_cluster(work: Work, shared: Any, tasks: list[Any], client: Any) -> Iter
             client.cancel(list(submitted), force=True)
 
 
-def perform(payload: bytes, task: bytes, double: bool | None) -> Any:
-    """Execute a task in a worker, whatever the number of its threads."""
+def perform(payload: bytes, tasks: list[bytes], double: bool | None) -> list[Any]:
+    """Execute tasks in a worker, whatever the number of its threads."""
     with _unpacking:
         work, shared = unpacked(payload, double)
-    return attempt(work, shared, pickle.loads(task))
+    return [attempt(work, shared, pickle.loads(task)) for task in tasks]
 
 
 _unpacking = threading.Lock()

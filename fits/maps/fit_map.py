@@ -166,7 +166,7 @@ def _fit_chunks(store: Store, job: Job, client: Any, options: MapOptions) -> lis
     total = sum(1 for _ in blocks_of(store.shape, store.chunk))
     done, poor, fitted = total - len(blocks), 0, 0
     options.progress("map", done, total)
-    for index, result in run(work, job, blocks, client=client):
+    for index, result in run(work, job, blocks, client=client, short=True):
         if isinstance(result, Failure):
             failures.append(f"chunk {block_words(blocks[index])}: {result.error}")
         else:

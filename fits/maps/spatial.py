@@ -112,7 +112,7 @@ def smooth_map(store: Store, job: Job, client: Any, options: MapOptions) -> None
                 if (mine := coloured[block]).any():
                     at, to, inverse_sd = (one[block][mine] for one in (units, centre, np.sqrt(precision)))
                     tasks.append(Half(block, mine, at, to, inverse_sd))
-            for index, result in run(work, job, tasks, client=client):
+            for index, result in run(work, job, tasks, client=client, short=True):
                 block, mine, *_ = tasks[index]
                 if isinstance(result, Failure):
                     raise ValueError(

@@ -51,6 +51,8 @@ def test_results_and_failures_do_not_depend_on_the_engine(request, cluster):
     outcomes = dict(run(tasks.picky, None, [0, 1, 2, 5], **engine))
     failures = {1: Failure("task is 1; it must not be"), 2: Failure("there.csv: no such file or directory")}
     assert outcomes == failures | {0: 0, 3: 5}
+    many = dict(run(tasks.picky, None, [0, 1, 2, 5] * 16, short=True, **engine))
+    assert many == {index: outcomes[index % 4] for index in range(64)}
     with pytest.raises(OSError, match="No space left") as full:
         list(run(tasks.picky, None, [0, 3, 5], **engine))
     assert (full.value.errno, full.value.filename) == (errno.ENOSPC, "full.csv")

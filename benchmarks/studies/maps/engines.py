@@ -75,8 +75,11 @@ def by_workers(one: StoredMap, size: Size, report: Report) -> list[Figure]:
         return []
     for index in range(size.rounds):
         for name, workers in (("one", 1), ("two", PROCESSES)):
-            with _meeting(tasks, workers * size.repeats, workers) as turns, local_cluster(workers) as client:
-                rates[name].append(steady(run_tasks(timed, job, turns, client=client)))
+            with local_cluster(workers) as client:
+                with _meeting(tasks, workers) as first:  # all have compiled
+                    list(run_tasks(timed, job, first, client=client))
+                turns = tasks * (workers * size.repeats)
+                rates[name].append(steady(run_tasks(timed, job, turns, client=client, short=True)))
         rates_now = ", ".join(f"{name} {values[-1]:.0f}" for name, values in rates.items() if values)
         report(f"workers, round {index + 1}: fits/s of {rates_now}")
     note = f"{figure(float(np.median(rates['one'])))} fits/s of one spawned process with one thread"
@@ -84,10 +87,10 @@ def by_workers(one: StoredMap, size: Size, report: Report) -> list[Figure]:
 
 
 @contextmanager
-def _meeting(tasks: list[Block], repeats: int, workers: int) -> Iterator[list[Block | Meeting]]:
-    """The chunks so many times, and before them one for each worker, after which they wait for each other."""
+def _meeting(tasks: list[Block], workers: int) -> Iterator[list[Meeting]]:
+    """A chunk for each worker, after which they wait for each other."""
     with tempfile.TemporaryDirectory(prefix="layerjax-meeting-") as folder:
-        yield [Meeting(task, folder, workers) for task in (tasks * workers)[:workers]] + tasks * repeats
+        yield [Meeting(task, folder, workers) for task in (tasks * workers)[:workers]]
 
 
 def steady(results: Iterable[tuple[int, Any]]) -> float:

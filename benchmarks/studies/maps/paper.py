@@ -45,7 +45,7 @@ def run(rows: Sequence[Row], size: Size, report: Report) -> tuple[list[Engine], 
     engines = [_engine("threads", run_tasks(empty, None, range(size.tasks)))]
     handed: float | None = None
     if why_no_cluster() is None:
-        tasks = run_tasks(empty, None, range(size.tasks), processes=PROCESSES)
+        tasks = run_tasks(empty, None, range(size.tasks), processes=PROCESSES, short=True)
         engines.append(_engine(f"dask, {PROCESSES} workers", tasks))
         handed = engines[-1].rate
     return engines, [on_paper(row, size.chunk, handed) for row in rows]
