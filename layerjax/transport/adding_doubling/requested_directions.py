@@ -78,5 +78,10 @@ def read_requested(solved: RequestedValues, wi: Vector, wo: Vector, side: Side) 
 def turn(wi: Vector, wo: Vector) -> Array:
     """Azimuth between the directions of travel."""
     sine, cosine = wi[1] * wo[0] - wi[0] * wo[1], -(wi[0] * wo[0] + wi[1] * wo[1])
-    at_pole = (sine == 0) & (cosine == 0)
-    return jnp.arctan2(jnp.where(at_pole, 0.0, sine), jnp.where(at_pole, 1.0, cosine))
+    return azimuth(cosine, sine)
+
+
+def azimuth(x: Array, y: Array) -> Array:
+    """Azimuth of a vector; along the normal 0, without a derivative."""
+    at_pole = (y == 0) & (x == 0)
+    return jnp.arctan2(jnp.where(at_pole, 0.0, y), jnp.where(at_pole, 1.0, x))

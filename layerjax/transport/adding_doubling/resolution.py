@@ -12,7 +12,7 @@ the cost of what is as narrow. `choose_transport` outside of ``jit`` knows bette
 
 import itertools
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -20,7 +20,7 @@ import numpy as np
 
 from layerjax._concrete import concrete_values
 from layerjax.compiling import is_traced
-from layerjax.stack import Interface, Stack, is_known, is_tilted
+from layerjax.stack import Interface, Medium, Stack, is_known, is_tilted
 from layerjax.surfaces import Conductor
 
 RESOLUTIONS = ((6, 8), (8, 12), (12, 16), (16, 24), (24, 32), (32, 48), (48, 64), (64, 96), (96, 128), (128, 192))
@@ -281,12 +281,13 @@ def _refracted_lobes(stack: Stack, assumed: float) -> Iterator[tuple[float, floa
     """
     faces = [layer for layer in stack.layers if isinstance(layer, Interface)]
     smooth = [face.is_smooth for face in faces]
-    if mirrors_in_closed_form(stack):  # what is left of light that is mirrored has met the facets from inside
+    mirror = isinstance(stack.base, Conductor) and stack.base.is_smooth
+    if mirrors_in_closed_form(
+        stack.layers, mirror
+    ):  # what is left of light that is mirrored has met the facets from inside
         yield _least_width(faces[0], assumed), max(1.0, _least(faces[0].ior, ASSUMED_INDEX))
         return
-    mirror = isinstance(stack.base, Conductor) and stack.base.is_smooth
-    in_closed_form = len(faces) == 2 and not has_tilted(stack)
-    if not (any(smooth) or mirror) and (stack.base is not None or len(faces) < 2 or in_closed_form):
+    if not (any(smooth) or mirror) and (stack.base is not None or len(faces) <= 2):
         return
     indices = [1.0, *(_least(face.ior, ASSUMED_INDEX) for face in faces)]
     known = [True, *(concrete_values(face.ior) is not None for face in faces)]
@@ -321,12 +322,11 @@ def resolutions(stack: Stack) -> Iterator[Resolution]:
         yield Resolution(*RESOLUTIONS[0], step) if tilted else Resolution(*step, ORDINATES[0])
 
 
-def mirrors_in_closed_form(stack: Stack) -> bool:
-    """Whether a mirror lies under a single interface, which is rough: what it sends back through the facets is known in
-    closed form, see `ballistic`."""
-    faces = [layer for layer in stack.layers if isinstance(layer, Interface)]
-    is_mirror = isinstance(stack.base, Conductor) and stack.base.is_smooth
-    return is_mirror and len(faces) == 1 and not faces[0].is_smooth and not has_tilted(stack)
+def mirrors_in_closed_form(layers: Sequence[Interface | Medium], is_mirror: bool) -> bool:
+    """Whether the base is a mirror and lies under a single interface, which is rough: what it sends back through the
+    facets is known in closed form, see `ballistic`."""
+    faces = [layer for layer in layers if isinstance(layer, Interface)]
+    return is_mirror and len(faces) == 1 and not faces[0].is_smooth
 
 
 def has_tilted(stack: Stack) -> bool:

@@ -64,7 +64,7 @@ class Plan(eqx.Module):
 def make_plan(stack: Stack, resolution: Resolution, multiple: bool) -> Plan:
     """The plan for a simplified stack."""
     common = any(map(is_smooth, stack.layers))
-    mirrored = (common or is_smooth(stack.base)) and not mirrors_in_closed_form(stack)
+    mirrored = (common or is_smooth(stack.base)) and not mirrors_in_closed_form(stack.layers, is_smooth(stack.base))
     if has_tilted(stack):
         nodes, azimuths = resolution.ordinates
         return Plan(nodes, azimuths // 2 + 1, azimuths, ranks(stack), multiple, common, mirrored)
@@ -119,7 +119,10 @@ def assemble(
             whole, is_expanded = expand_modes(whole, plan.azimuths), True
         whole = add(expand_modes(found, plan.azimuths) if is_expanded and not tilted else found, whole)
     layers = [found for found, _ in solved]
-    return grid, whole, subtract_ballistic(stack, layers, whole), outer_faces(stack, layers)
+    joined = layers
+    if is_expanded:
+        joined = [found if tilted else expand_modes(found, plan.azimuths) for found, tilted in solved]
+    return grid, whole, subtract_ballistic(stack, joined, whole), outer_faces(stack, layers)
 
 
 def can_be_split(stack: Stack) -> bool:
