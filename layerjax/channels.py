@@ -32,7 +32,7 @@ def count(*values: Sequence[Any]) -> int:
     return max((len(value) for value in values), default=1)
 
 
-def map_channels(function: Callable[..., Array], *values: Sequence[Array]) -> Channels:
+def map_channels(function: Callable[..., T], *values: Sequence[Any]) -> tuple[T, ...]:
     """The function of the values of each channel; computed once where every value serves all channels."""
     return tuple(function(*(pick(value, c) for value in values)) for c in range(max(1, count(*values))))
 

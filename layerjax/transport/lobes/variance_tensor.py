@@ -4,8 +4,6 @@ An isotropic variance is a multiple of the unit tensor, so that arrays may be ad
 multiplied by and divided by are arrays: shares of light, and factors of refraction.
 """
 
-from typing import Any
-
 import equinox as eqx
 import jax.numpy as jnp
 from jax import Array
@@ -20,13 +18,6 @@ SPLIT = {32: 5e-3, 64: 6e-6}
 rounding."""
 
 
-Variance = Any
-"""An array, or a `VarianceTensor`."""
-
-Variances = tuple[Variance, ...]
-"""One for all channels, or one for each."""
-
-
 class VarianceTensor(eqx.Module):
     """A symmetric tensor by its entries along x and y. Sums with arrays, products and quotients by them are tensors."""
 
@@ -36,7 +27,7 @@ class VarianceTensor(eqx.Module):
 
     __array_ufunc__ = None  # so that arrays of numpy leave sums and products to it
 
-    def __add__(self, other: Variance) -> "VarianceTensor":
+    def __add__(self, other: "Variance") -> "VarianceTensor":
         if isinstance(other, VarianceTensor):
             return VarianceTensor(self.xx + other.xx, self.xy + other.xy, self.yy + other.yy)
         return VarianceTensor(self.xx + other, self.xy, self.yy + other)
@@ -50,13 +41,20 @@ class VarianceTensor(eqx.Module):
     def __neg__(self) -> "VarianceTensor":
         return VarianceTensor(-self.xx, -self.xy, -self.yy)
 
-    def __sub__(self, other: Variance) -> "VarianceTensor":
+    def __sub__(self, other: "Variance") -> "VarianceTensor":
         return self + (-other)
 
-    def __rsub__(self, other: Variance) -> "VarianceTensor":
+    def __rsub__(self, other: "Variance") -> "VarianceTensor":
         return -self + other
 
     __radd__, __rmul__ = __add__, __mul__
+
+
+Variance = Array | VarianceTensor
+"""Of a lobe, the same along all azimuths or not."""
+
+Variances = tuple[Variance, ...]
+"""One for all channels, or one for each."""
 
 
 def facet_variance(width: Array | Widths) -> Variance:
