@@ -253,12 +253,13 @@ def _overlap(outside: tuple[Vector, Vector], ratios: tuple[Array, Array], faces:
     (a, b), (c, d) = ((width.alpha, width.alpha_y) for width in widths)
     azimuths = [0.0 if width.tangent is None else width.tangent for width in widths]
     along, across = jnp.cos(azimuths[0] - azimuths[1]) ** 2, jnp.sin(azimuths[0] - azimuths[1]) ** 2
-    size = a * b + c * d
+    size = a * b + c * d  # all determinants are over its square
     p, q = a * b / size, c * d / size
     crossed = along * ((a * d - b * c) / size) ** 2 + across * ((a * c - b * d) / size) ** 2
-    whole = 1.0 + crossed  # det(A + B) / size^2
+    whole = 1.0 + crossed  # det(A + B)
     first, second = (rotate(width.alpha**2, width.alpha_y**2, width.tangent) for width in widths)
     xx, xy = ((p * p * two + q * q * one) / whole for one, two in zip(first[:2], second[:2], strict=True))
+    # A (A + B)^-1 = (det(A) + A adj(B)) / det(A + B)
     x, y = (end - start for start, end in zip(*middles, strict=True))
     u, v = (second[2] * x - second[1] * y) / size, (second[0] * y - second[1] * x) / size
     x = middles[0][0] + (p * p * x + (first[0] * u + first[1] * v) / size) / whole

@@ -51,7 +51,7 @@ class VarianceTensor(eqx.Module):
 
 
 Variance = Array | VarianceTensor
-"""Of a lobe, the same along all azimuths or not."""
+"""The variance of a lobe: an array where it is the same along all azimuths."""
 
 Variances = tuple[Variance, ...]
 """One for all channels, or one for each."""

@@ -223,7 +223,7 @@ def test_solver_and_walk_agree(stack):
     exact, doubt = lj.evaluate_with_error(stack, wi, wo, lj.AddingDoubling(ordinates=(12, 20)))
     mean, error = lj.evaluate_with_error(stack, wi, wo, lj.RandomWalk(paths=60_000), key=jax.random.key(0))
     assert np.all(np.abs(exact - mean) < 4.0 * error + doubt)
-    assert np.all(doubt < 0.1 * exact)  # through a slab both refractions are on the grid
+    assert np.all(doubt < 0.1 * exact)
 
 
 def test_what_it_cannot_be_is_refused_by_name():
