@@ -282,9 +282,7 @@ def _refracted_lobes(stack: Stack, assumed: float) -> Iterator[tuple[float, floa
     faces = [layer for layer in stack.layers if isinstance(layer, Interface)]
     smooth = [face.is_smooth for face in faces]
     mirror = isinstance(stack.base, Conductor) and stack.base.is_smooth
-    if mirrors_in_closed_form(
-        stack.layers, mirror
-    ):  # what is left of light that is mirrored has met the facets from inside
+    if mirrors_in_closed_form(stack.layers, mirror):  # what is left of it has met the facets from inside
         yield _least_width(faces[0], assumed), max(1.0, _least(faces[0].ior, ASSUMED_INDEX))
         return
     if not (any(smooth) or mirror) and (stack.base is not None or len(faces) <= 2):
