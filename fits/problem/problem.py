@@ -481,7 +481,7 @@ def _directions(problem: Problem, wi: Floats, wo: Floats, other_rays: bool = Fal
     of_pairs = not isinstance(problem.data, Totals)  # whose light leaves along all directions
     # where known directions are of no use, programs should not depend on how many there are
     follow = of_pairs and (
-        transport == "auto" or (isinstance(transport, lj.Transport) and transport.uses_known_directions)
+        isinstance(transport, str) or (isinstance(transport, lj.Transport) and transport.uses_known_directions)
     )
     pair = of_pairs and isinstance(transport, lj.Transport) and transport.uses_known_pairs
     if problem.instrument is not None:
