@@ -11,18 +11,16 @@ from benchmarks.studies import samplers
 from tests.helpers.models import line_fit
 
 PLAIN = samplers.Sampled(
-    "line", samplers.PLAIN, ["a"], [[-1.0], [0.0], [1.0]], [1.0], 6000.0, 100, 32, 0.5, 0, True, "", 1.0
+    "line", samplers.PLAIN, ["a"], [[-1.0], [0.0], [1.0]], [[0.03]] * 3, [1.0], 2e3, 100, 32, 0.5, 0, True, "", 1.0
 )
 
 
-@pytest.mark.parametrize(
-    ("shift", "effective", "verdict"),
-    [(0.05, 6000.0, "agree"), (0.2, 6000.0, "**differ**"), (0.05, 4000.0, "too short")],
-)
-def test_verdicts(shift: float, effective: float, verdict: str) -> None:
+@pytest.mark.parametrize(("shift", "error", "verdict"), [(0.19, 0.04, "agree"), (0.21, 0.04, "**differ**")])
+def test_verdicts(shift: float, error: float, verdict: str) -> None:
     quantiles = (np.array(PLAIN.quantiles) + shift).tolist()
-    other = dataclasses.replace(PLAIN, sampler="NUTS", quantiles=quantiles, effective=effective)
+    other = dataclasses.replace(PLAIN, sampler="NUTS", quantiles=quantiles, standard_errors=[[error]] * 3)
     assert samplers.quantile_difference(other, PLAIN) == pytest.approx(shift)
+    assert samplers.difference_in_errors(other, PLAIN) == pytest.approx(shift / 0.05)
     assert samplers._row(other, PLAIN)[-1] == verdict
     assert samplers._row(PLAIN, PLAIN)[-1] == "-"
 
